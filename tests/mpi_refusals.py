@@ -46,7 +46,7 @@ try:
     message = "accepted"
 except ValueError as error:
     message = str(error)
-assert message.startswith("Hencky: bulk: values at positions depend on the other positions"), message
+assert message.startswith("Hencky: bulk: the value at a position depends on other positions"), message
 
 
 def seen(simulation):

@@ -65,7 +65,7 @@ class _Scope:
     surfaces: dict[str, tuple[str, list[tuple[str, str]]]] = field(default_factory=dict)
 
     def entry(self, options: Mapping[str, str], instance: str, rows: NDArray[np.int64] | str) -> None:
-        """Add an entry to a set of elements."""
+        """Add element numbers, or the name of another set, to a set of elements."""
         name = options["ELSET"]
         self.sets.setdefault(name.upper(), _Set(name, "INTERNAL" in options)).entries.append((instance.upper(), rows))
 
@@ -276,7 +276,7 @@ def _unique(
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return, by name, the cells of instances, element sets and surfaces in each block of cells."""
+    """Return the cells of instances, element sets and surfaces in each block of cells, by name."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [
         [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed
@@ -317,7 +317,7 @@ def _members(
 
 
 def _surfaces(placed: list[_Placed], cells: list, numbers: list) -> Iterator[tuple[str, str, NDArray[np.int64]]]:
-    """Return the name, cell type and nodes of the facets of each surface."""
+    """Return the name of each surface, with the cell type and the nodes of its facets."""
     out: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
     for k, one in enumerate(placed):
         for name, pairs in one.scope.surfaces.values():

@@ -26,7 +26,7 @@ class Body:
     """
 
     material: int = 0  # index in the scene's list of materials
-    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None  # maps corners of the boxes
+    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None  # moves corners of reference domains
 
     def __len__(self) -> int:
         raise NotImplementedError
@@ -41,7 +41,7 @@ class Body:
         return self.reference(chosen).min(axis=1)
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether each face (domain, axis, end) of the chosen domains lies on the body's surface, (n, d, 2)."""
         raise NotImplementedError
 
     @property
@@ -51,7 +51,7 @@ class Body:
 
     @property
     def sides(self) -> NDArray[np.bool_]:
-        """Whether the faces (n, d, 2) of all domains lie on the surface of the body."""
+        """Whether each face (domain, axis, end) of all domains lies on the body's surface, (n, d, 2)."""
         return self.sides_of(slice(None))
 
     @property
@@ -129,7 +129,7 @@ class Body:
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the images (..., d) of reference positions (..., d) under `map`, both in m."""
-        if self.map is None or not X.size:  # user maps may fail for no positions
+        if self.map is None or not X.size:  # user maps may fail for an empty array
             return X
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
@@ -138,7 +138,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the largest distance (n,), in m, of straight edges of each chosen domain from the mapped edges."""
+        """Return the largest distance (n,), in m, between each chosen domain's edges and its mapped reference edges."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out

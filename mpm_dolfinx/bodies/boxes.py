@@ -76,7 +76,7 @@ class LatticeBody(Body):
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether each face (domain, axis, end) of the chosen domains lies on the body's surface, (n, d, 2)."""
         index = self._index(chosen)
         out = np.stack([index == 0, index == np.array(self.count) - 1], axis=-1)
         if self.filled is None:
@@ -169,7 +169,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     lower, upper : (d,), m
         Corners of the box, inside the grid.  Corners need not lie on grid lines.
     per_cell
-        Points per cell and direction, >= 1, up to rounding: whole domains fill the box.  With 1 point, bodies are too
+        Points per cell and direction, >= 1, rounded so that whole domains fill the box.  With 1 point, bodies are too
         flexible and creep.  In 3D, use at least 2.
     material
         Index of the material in the scene's list, >= 0.

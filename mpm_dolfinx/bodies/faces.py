@@ -37,13 +37,13 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 class Surface:
     """Faces of particle domains on one side of the bodies.
 
-    Every process has the same faces.  Parts of faces in contact with another body are excluded.  The area of each face
-    without contact is divided into triangles and quadrilaterals.  Arrays have one row for each of these m polygons.
+    Every process has the same faces.  Parts of faces in contact with another body are excluded.  The rest of each face
+    is divided into triangles and quadrilaterals.  Arrays have a row for each of these m polygons.
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
     face: NDArray[np.int64]  # index of the face in its domain (m,), see `grid.FACES`
-    # corners (m, 2^(d-1), d) of the polygon, in local coordinates of the domain from -1 to 1; triangles repeat the last
+    # corners (m, 2^(d-1), d) of the polygon, in local coordinates of the domain, -1 to 1; triangles repeat a corner
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
     before: NDArray[np.float64]  # reference positions of the domain's corners, before all maps (m, 2^d, d), m
@@ -135,7 +135,7 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 def surface(
     bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the faces on a side of the active bodies, without parts in contact with other bodies at seeding.
+    """Return the faces on a side of the active bodies, without the parts that touch other bodies at seeding.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Clip parts of faces to a region.  Return, for each clipped part, the index of its face, and its corners."""
+    """Clip parts of faces to a region.  Return the index of the face, and the corners, of each clipped part."""
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
     bent = np.zeros(len(X), dtype=bool)
@@ -251,7 +251,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide parts of faces into triangles, and clip these to a region.  Return the triangles, and the part of each."""
+    """Divide parts of faces into triangles, and clip these to a region.  Return each triangle, and its part's index."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -267,7 +267,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return faces and corners of the parts of faces without contact to other bodies.  Triangles repeat a corner."""
+    """Return the face and the corners of each part of a face without contact.  Triangles repeat a corner."""
     on = [covers(own, other) for other in others]
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)

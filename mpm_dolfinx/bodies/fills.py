@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-UPRIGHT = 0.95  # cosine of the largest angle between an axis and normals of mesh faces on the side opposite a contact
+UPRIGHT = 0.95  # cosine of the largest angle between an axis and the normals of faces on the side opposite to a contact
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Contact:
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return the largest distance, in m, of corners of the body's faces from the faces of the displaced fill."""
+        """Return the largest distance, in m, between corners of the body's faces and faces of the displaced fill."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -77,9 +77,9 @@ def put(
     Parameters
     ----------
     bodies, others, fill
-        All bodies of the scene; the indices of the active bodies; the index of the fill.
+        All bodies (`bodies`), the indices of the active bodies (`others`), and the index of the fill (`fill`).
     points, new
-        Points of this process: the present points of the active bodies; the seeded points of the fill.
+        Points of this process: present points of the active bodies (`points`), and seeded points of the fill (`new`).
 
     Raises
     ------
@@ -157,7 +157,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # normal to walls of the grid
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # components normal to walls
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))
@@ -175,7 +175,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements of a network of springs with stiffness K, and with given u at `fixed` nodes."""
+    """Return the displacements of a network of springs with stiffness K, if the `fixed` nodes move by u."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -208,7 +208,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
     if ratio[k] < TANGLED:
         raise ValueError(
             f"{name}; the domain at {corners[k].mean(axis=0) + grid.base} keeps {ratio[k]:.2g} of its volume, "
-            f"must keep {TANGLED}"
+            f"must keep at least {TANGLED}"
         )
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):
@@ -219,7 +219,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the overlap (m) of body and fill, their gap (cells), and the position; overlap or gap is 0."""
+    """Return the overlap (m) of body and fill, their gap (cells), and its position; one of overlap and gap is 0."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, np.full(len(c), MISFIT / 2 * grid.least + misfit)) for c in (points.corners[rows], corners)]

@@ -25,7 +25,7 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""Name in meshio and number of nodes of each gmsh element type, with the nodes in gmsh's sequence."""
+"""Name in meshio and number of nodes of each gmsh element type.  The nodes of elements are in gmsh's order."""
 
 
 class _Numbers:
@@ -92,7 +92,7 @@ def _section(data: bytes, name: str) -> bytes:
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return, by name, the tags and dimensions of the physical groups with this name."""
+    """Return the tags and dimensions of all physical groups, by name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -127,7 +127,7 @@ def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int64]]]:
-    """Yield, for each entity, its dimension, tag, cell type, and the nodes of its elements."""
+    """Yield the dimension, tag, cell type and element nodes of each entity."""
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:

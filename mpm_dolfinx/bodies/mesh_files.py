@@ -195,10 +195,10 @@ def _positions(dim: int, points: Any) -> NDArray[np.float64]:
 def _first_order(
     name: str, x: NDArray[np.float64], mesh: meshio.Mesh, known: Mapping[str, int], counted: Collection[str]
 ) -> list[tuple[str, NDArray[np.int64]]]:
-    """Return the cell type, and the corners of the cells, for each block of cells of a known type.
+    """Return the cell type, and the corners of the cells, of each block whose type is in `known`.
 
     `known`: number of corners of each cell type.
-    `counted`: cell types for which cells of second order cause a warning.
+    `counted`: cell types whose cells of second order cause a warning.
     """
     blocks = []
     curved, off = 0, 0.0
@@ -242,7 +242,7 @@ def _warn_curved(name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Return all cells, and the cells of each part.  Cells repeated by several gmsh groups occur once."""
+    """Return all cells, and the cells of each part.  Cells that several gmsh groups repeat are returned once."""
     cells = dict(cells)
     for kind, rows in cells.items():
         first, same = distinct(np.sort(rows, axis=1))
@@ -251,7 +251,7 @@ def _merged(
         several = np.flatnonzero(np.bincount(same)[same] > 1)
         member = np.stack([np.isin(several, found[kind]) for found in parts.values()] or [np.zeros(len(several), bool)])
         if len(np.unique(np.stack([same[several], *member]), axis=1).T) < len(several):
-            continue  # repeated in the same parts: an error if the cell is seeded
+            continue  # cells repeated in the same parts are an error if they are seeded
         order = np.argsort(first)  # in the order of the file
         number = np.empty_like(order)
         number[order] = np.arange(len(order))
@@ -271,7 +271,7 @@ def _groups(
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield the name of each group, and which cells of a block belong to the group."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
-    families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of groups for each number
+    families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of the groups of each tag
     for key in (tags,) if tags is not None else TAGS:
         if key not in mesh.cell_data:
             continue

@@ -45,7 +45,8 @@ def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
     counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
     read, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
     if len(counts) > 1 and read != whole:
-        raise ValueError(f"{len(counts)} pieces with {whole} cells, must be one piece, because meshio reads {read}")
+        why = f"because meshio reads only the last piece, of {read} cells"
+        raise ValueError(f"{len(counts)} pieces with {whole} cells in total, must be one piece, {why}")
 
 
 def check_systems(mesh: meshio.Mesh) -> None:

@@ -74,7 +74,7 @@ class MeshBody(Body):
         return self.vertices.shape[2]
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether each face (domain, axis, end) of the chosen domains lies on the body's surface, (n, d, 2)."""
         return self.surface[chosen]
 
     @property
@@ -315,7 +315,7 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the different mesh facets, and for each face the index of its facet, or 0 for faces inside cells."""
+    """Return the different mesh facets, and the facet index of each face, or 0 for faces inside cells."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
@@ -336,7 +336,7 @@ def _split(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
     """Divide domains that are large compared with the cells of the grid.
 
-    For each new domain, return its corners, its original domain, and which of its faces lie on the original's.
+    Return the corners and the original domain of each new domain, and which of its faces lie on the original's faces.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

@@ -36,7 +36,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses at the heights of x, and ground levels, on vertical lines through `places`."""
+    """Return overburden stresses and ground levels above the heights of x, on vertical lines through `places`."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -66,7 +66,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield, for each face, the crossings of line i with domain i: indices of lines, heights in m, and signs.
+    """Yield the crossings of line i with each face of domain i: indices of lines, heights in m, and signs.
 
     The sign is 1 if an upward line leaves the domain, and -1 if the line enters the domain.
     """
@@ -84,7 +84,7 @@ def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDA
         for corner in ABOUT_MIDDLE:
             part = x[:, corner]
             off = part[:, :, :2] - at[:, None]
-            area = cross_in_plane(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # opposite to each corner
+            area = cross_in_plane(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # areas opposite to each corner
             on = np.flatnonzero((area > 0).all(axis=1) | (area < 0).all(axis=1))
             area = area[on]
             whole = area.sum(axis=1)

@@ -33,7 +33,7 @@ class Faces:
     index: NDArray[np.int64]  # indices of the face's corners in the domain (m, 4)
     corners: NDArray[np.float64]  # positions of the corners (m, 4, 3), m
     outward: NDArray[np.float64]  # outward area vector (m, 3), m^2
-    bend: NDArray[np.float64]  # distance of straight edges from the mapped ones (m,), m, see `Body.bend`
+    bend: NDArray[np.float64]  # distance of the domain's edges from mapped edges (m,), m, see `Body.bend`
 
     @classmethod
     def of(cls, body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> Faces:
@@ -66,8 +66,8 @@ class Cover:
     Face coordinates run from 0 to 1 along two edges of the covered face.
     """
 
-    face: NDArray[np.int64]  # the covered face (n,)
-    by: NDArray[np.int64]  # the covering face (n,)
+    face: NDArray[np.int64]  # index of the covered face (n,)
+    by: NDArray[np.int64]  # index of the covering face (n,)
     low: NDArray[np.float64]  # lower corner of the covering face's bounding box (n, 2), in face coordinates
     high: NDArray[np.float64]  # upper corner of this box (n, 2)
     corner: NDArray[np.int64]  # corner of this box for each corner of the covering face (n, 4); -1 for rotated faces
@@ -227,7 +227,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return the triangles, and the `owner` of each."""
+    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return the triangles, each with its entry of `owner`."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -237,7 +237,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide each quadrilateral into two triangles.  Return the triangles, and the `owner` of each."""
+    """Divide each quadrilateral into two triangles.  Return the triangles, each with its entry of `owner`."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -248,7 +248,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Cut triangles (3, e, n) by a plane.  Return the parts below and above it, each with its `owner`."""
+    """Cut triangles (3, e, n) by a plane.  Return the parts below and above it, each with its entry of `owner`."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)

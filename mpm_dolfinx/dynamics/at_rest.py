@@ -27,17 +27,17 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """For each side of bodies at rest, return its points, and the tractions that replace its reactions.
+    """Return the points of each side of bodies at rest, and the tractions that replace the reactions of this side.
 
     Tractions are forces per reference area, computed from the stresses.  Additional tractions vary like rigid-body
-    displacements.  They adapt the resultant and the moment on each connected part to its reactions.
+    displacements.  They give each connected part the same resultant force and moment as its reactions.
 
     `stresses`: total stresses (faces, k, k), in Pa, with k = d or 3, at the faces of each side.
     `parts`: connected parts of the bodies.
     `forces` (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
     `held` (nodes, d): whether each displacement component of a node remains fixed.
 
-    Returns for each side the ids (n,) of its points and the tractions (n, d), in Pa.
+    Returns the ids (n,) of the points on each side and their tractions (n, d), in Pa, by name of the side.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))

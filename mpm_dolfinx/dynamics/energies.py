@@ -83,7 +83,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies after a renewal of domains, in J.  The entry `renewal` is the loss by all renewals."""
+    """Return the energies after a renewal of domains, in J.  The entry `renewal` is the energy lost in all renewals."""
     if not renewed:
         return energy
     now = stored(materials, new)

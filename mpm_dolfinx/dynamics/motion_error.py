@@ -25,15 +25,15 @@ def motion_error(
 ) -> tuple[float, float]:
     """Return the estimated error of a step and the size of its motion, both in J^(1/2).
 
-    The substeps end with the velocities v1, v2 and accelerations a1, a2.  A first-order step would give a velocity that
-    differs by `seconds * (a2 - a1)`, and a displacement that differs by `seconds * (v2 - v1)`.  The estimate is `ERROR`
-    times the energy norm of these differences.  In a resolved mode of angular frequency omega, the true error is 0.081
-    omega dt times this norm, with the step length dt.  In unresolved modes, a linear solve with the matrix of the
-    substep limits the estimate (Hosea and Shampine 1996).
+    The first substep ends with the velocity v1 and the acceleration a1, and the last substep with v2 and a2.  A
+    first-order step would give a velocity that differs by `seconds * (a2 - a1)`, and a displacement that differs by
+    `seconds * (v2 - v1)`.  The estimate is `ERROR` times the energy norm of these differences.  In a resolved mode of
+    angular frequency omega, the true error is 0.081 omega dt times this norm, with the step length dt.  In unresolved
+    modes, a linear solve with the matrix of the substep limits the estimate (Hosea and Shampine 1996).
 
     `K`, `mass`: momentum tangent and mass matrix of the last substep.
     `flights`: velocities and accelerations after the two substeps.
-    `seconds`, `own`: weights, in s, of the first and the last substep's time derivatives in the last substep.
+    `seconds`, in s: weight of the first substep's time derivatives in the last substep.  `own`: weight of its own.
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights

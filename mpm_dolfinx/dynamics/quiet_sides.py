@@ -33,7 +33,7 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Forms at points on quiet sides, with three fields.
+    """Forms at points on quiet sides, with the normal and three more fields.
 
     `across`: tangential impedance, in kg/m^2/s.
     `along`: normal impedance minus tangential impedance, in kg/m^2/s.

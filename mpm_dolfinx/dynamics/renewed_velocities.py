@@ -23,7 +23,7 @@ class Momenta(NamedTuple):
 
     mass: NDArray[np.float64]  # (groups,), kg
     centre: NDArray[np.float64]  # centre of mass (groups, 2), m
-    velocity: NDArray[np.float64]  # of the centre (groups, 2), m/s
+    velocity: NDArray[np.float64]  # velocity of the centre (groups, 2), m/s
     angular: NDArray[np.float64]  # angular momentum about the centre (groups,), kg m^2/s
     inertia: NDArray[np.float64]  # moment of inertia about the centre (groups,), kg m^2
 
@@ -33,7 +33,7 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups of pieces.
 
-        `piece`, `group` (k,): for each of k pieces, its index in `pieces`, and the index of its group.
+        `piece` (k,): index in `pieces` of each of k pieces.  `group` (k,): index of the piece's group.
         `mass` (k,), in kg: masses of these pieces.
         `v` (n, 2), in m/s: velocity of each domain.
         `L` (n, 2, 2), in 1/s: velocity gradient of each domain.
@@ -110,6 +110,6 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of the removed domains, the group of new domains that receives each, and its mass."""
+    """Return each piece of a removed domain, the group of new domains that receives the piece, and its mass."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]

@@ -23,7 +23,7 @@ PLACES = ("t", "x")
 
 
 def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
-    """Raise ValueError if grid lines cannot follow an object, or if a grid has no lines."""
+    """Raise ValueError if grid lines cannot follow the object `follow`, or if there are no `lines`."""
     if hasattr(follow, "pose"):
         if lines is not None and all(map(equal, checked(lines))):
             raise ValueError(f"grid: follow = {line(follow)}: all cells are equal, must be smaller around the tool")

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-With equal cells, a division finds the cell of a point.  Other grids search along each axis.  Methods such as
-`sizes` and `volumes` return a value for each cell, but for equal cells a single row (`h`) or a single number.
+In a grid of equal cells, a division finds the cell of a point.  Other grids search the lines along each axis.  Methods
+such as `sizes` and `volumes` return an entry for each cell.  If all cells are equal, `sizes` returns a single row
+(`h`), and `volumes` a single number.
 
-The mesh is created at its first use.  Before, a simulation distributes the cells so that processes have similar numbers
+The mesh is created at its first use.  A simulation first distributes the cells so that processes have similar numbers
 of points.
 """
 
@@ -36,7 +37,7 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Axis and end of each side of a box.  The end is 0 at the lower coordinate, and 1 at the upper coordinate."""
-REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: walls act by penalties, inexactly
+REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: penalties of walls are inexact
 
 TURN = 2 * np.pi
 """Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""
@@ -67,8 +68,8 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Corner indices (2d, 2^(d-1)) of the faces of a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Direction of the normals (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D, only the
-first four apply.
+"""Sign (6,) of the normal that follows from the order of the corners in `FACES`, for each face: 1 if this normal points
+outward, and -1 if inward.  In 2D, only the first four apply.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles that divide a face in 3D symmetrically.  Each triangle has two corners of the face and its middle."""
@@ -110,7 +111,7 @@ def means_of_rows(index: NDArray, weight: NDArray, rows: NDArray[np.float64], si
 
 
 def linked(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the group index (count,) of each object, and the number of groups.  Links connect objects of a group.
+    """Return the group index (count,) of each object, and the number of groups.  Linked objects are in one group.
 
     `one`, `other` (m,): the two objects of each link.
     """
@@ -147,7 +148,7 @@ def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return for each of the `numbers` (...) whether the sorted array `chosen` (m,) contains the number."""
+    """Return a mask (...) of the `numbers` (...) that the sorted array `chosen` (m,) contains."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
@@ -166,7 +167,7 @@ def values_at(
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return as UFL the lengths of the "+" and "-" cells along the normal n of their face, and the mean length."""
+    """Return the lengths of the "+" and "-" cells along the normal n of their face, and the mean length, as UFL."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -459,7 +460,8 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
-        """Move the lines of a grid with `follow` to coordinates (n,) under the keys "x", "y", "z", in m from the base.
+        """Move the lines of a grid that has `follow` to `lines`: coordinates (n,) for "x", "y", "z", in m from the
+        base.
 
         With None, the lines return to their initial coordinates.  All coordinates of nodes, cells and mesh are then
         bitwise equal to coordinates in a new grid with these lines.
@@ -494,7 +496,7 @@ class Grid:
         return self._h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,) of midpoints of local cells from midpoints of neighbours along an axis, in m."""
+        """Return the distances (n,), in m, between midpoints of local cells and of their neighbours along an axis."""
         return self._h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
@@ -562,7 +564,7 @@ class Grid:
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,) above coordinates x (n,), both in m, along an axis of unequal cells, or inf."""
+        """Return the next line (n,) above each coordinate x (n,), or inf, along an axis of unequal cells; all in m."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -591,14 +593,14 @@ class Grid:
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh, if it does not exist, with equal sums of the loads (cells,) on all processes."""
+        """Create the mesh, if it does not exist, such that processes have nearly equal sums of `load`, see `shared`."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return a grid in which loads are evenly distributed among processes: this grid, or a copy with another mesh.
+        """Return a grid whose processes have nearly equal sums of `load`: this grid, or a copy with another mesh.
 
-        `load` (cells,): load >= 0 of each cell, such as its number of points.
+        `load` (cells,): work >= 0 to compute each cell, such as its number of points.
         `keep`: whether to return this grid in any case, because other objects use its mesh.
         """
         new = boxes(load.reshape(self.shape), self.comm.size)
@@ -626,7 +628,7 @@ class Grid:
         Partition(boxes, tuple(self.shape))
 
     def distributed(self, boxes: NDArray[np.int64]) -> Grid:
-        """Return a copy of this grid, with its present lines, in which processes own the boxes (ranks, 2, d)."""
+        """Return a copy of this grid, with its present lines.  Each process owns one of the boxes (ranks, 2, d)."""
         other = self._again()
         other.seeded, other._spacing = self.seeded, self._spacing
         other._cells = other._made(boxes)
@@ -653,7 +655,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
     def _nodes(self) -> NDArray[np.float64]:
-        """Return the positions of the nodes that this process contributes, in lexicographic order."""
+        """Return the positions of the nodes that this process contributes to a new mesh, in lexicographic order."""
         count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
@@ -680,7 +682,7 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return for each of the material points `ids` (n,) the index of the first cell in its copy of the box."""
+        """Return the index (n,) of the first cell in the copy of the box that contains each point of `ids` (n,)."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
@@ -758,7 +760,7 @@ class Grid:
         return self.locals[cell], x, fields
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices (n, d + 1) of local nodes (n,): along each axis, and of the copy of the box."""
+        """Return the indices (n, d + 1) of local nodes (n,): one along each axis, and the index of the box's copy."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
@@ -786,14 +788,12 @@ class Grid:
         return fetch.back(values_at(fetch.send(new), node, store.send(rows)[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices (n, d + 1) of local cells (n,): along each axis, and of the copy of the box."""
+        """Return the indices (n, d + 1) of local cells (n,): one along each axis, and the index of the box's copy."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local indices (n, d, 2) of the neighbours of local cells, by axis and end.  The index is -1 if a
-        neighbour is not on this process.
-        """
+        """Return the local indices (n, axis, end) of the neighbours of local cells, or -1 if not on this process."""
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
@@ -817,8 +817,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d) of the Q1 shape functions of local cells at points x, in 1/m.
 
-        In 3D with `mixed`, gradients are means over pieces with centroids x.  `mixed` (n, 3), m^2: means over each
-        piece of products of two offsets from its centroid.
+        If `mixed` is given in 3D, gradients are means over pieces with centroids x.  `mixed` (n, 3), m^2: means over
+        each piece of products of two offsets from its centroid.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None]
         dN = np.empty((*hats[0].shape, self.dim))
@@ -883,9 +883,7 @@ class Grid:
 
 
 def begin_with(name: str, grid: Any) -> None:
-    """Reset moved lines of a grid to their initial coordinates, for new bodies and scenes.  Raise ValueError if `grid`
-    is not a Grid.
-    """
+    """Reset moved lines of a grid to their initial coordinates.  Raise ValueError if `grid` is not a Grid."""
     instance(name, grid, Grid)
     grid.move(None)
 
@@ -917,5 +915,5 @@ class GridOfGroups(Grid):
         return GridOfGroups(self, self._group, self._starts)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return for each of the material points `ids` (n,) the index of the first cell in its copy of the box."""
+        """Return the index (n,) of the first cell in the copy of the box that contains each point of `ids` (n,)."""
         return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Partition of the grid's cells among processes: recursive coordinate bisection, weighted by loads.
+"""Partition of the grid's cells among processes: recursive coordinate bisection, weighted by the work of each cell.
 
 dolfinx's partitioners distribute the whole background grid.  Most cells are empty, so one process might hold the whole
-body.  Here the box of the grid is bisected recursively into halves of equal load (Berger and Bokhari 1987).  Each plane
+body.  Here the box of the grid is bisected recursively into halves of equal work (Berger and Bokhari 1987).  Each plane
 of bisection lies between cells, normal to the longest extent of the filled cells.
 """
 
@@ -75,7 +75,7 @@ class Partition:
 def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
     """Return the boxes of cells (ranks, 2, d) of all ranks, see `Partition`.
 
-    `load` (cells along each axis): load >= 0 of each cell, such as its number of points.
+    `load` (cells along each axis): work >= 0 to compute each cell, such as its number of points.
     `processes`: number of ranks, >= 1.
     """
     filled = load > 0
@@ -96,7 +96,7 @@ def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
-    """Return the largest sum of loads in a box, divided by the mean sum.  The result is 1 if all loads are 0."""
+    """Return the largest sum of `load` in a box, divided by the mean sum.  The result is 1 if all sums are 0."""
     each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
     return float(each.max() / each.mean()) if each.any() else 1.0
 
@@ -104,7 +104,7 @@ def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
     """Divide a box of cells into a box for each rank, written to `out`.
 
-    If there are enough cells, each rank gets at least one cell, even if this makes loads less equal.
+    If there are enough cells, each rank gets at least one cell, even if this makes the work less equal.
     """
     count = len(out)
     if count == 1 or weight.size == 1:
@@ -115,8 +115,8 @@ def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray
     if len(layers) == 1:  # all filled cells lie in one layer
         axis = int(np.argmax(weight.shape))
         layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
-    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless ranks stay idle
+    cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # numbers of cells below each plane
+    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless some get no cell
     even = (ranks == count // 2) | (ranks != count // 2).all()
     off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
     plane = int(np.argmin(np.where(even, off, np.inf)))
@@ -134,7 +134,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return one list of the ranks that have each cell, owner first, and the index at which each cell begins.
+    """Return one list of the ranks that have each cell, owner first, and the position in it at which each cell begins.
 
     `cells` (n,): lexicographic indices.  A cell is a ghost on the processes that own its neighbours across faces.
     """

@@ -43,7 +43,7 @@ FORMAT, VERSION = "mpm_dolfinx checkpoint", 16  # Source: the format of the file
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 POINTS, PIECES = "points/id", "pieces/id"
-# beginning of the names of arrays that are stored by rows: name of the array that numbers these rows
+# first part of the names of arrays that are stored by rows -> name of the array that numbers these rows
 NUMBERED = {"points/": POINTS, "stay/": POINTS, "trend/rates": POINTS, "pieces/": PIECES}
 NUMBERED |= {f"{name}/": f"{name}/node" for name in NODAL}
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
@@ -149,7 +149,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
             arrays |= read(comm, file, rows, together(comm, lambda: _ranges(comm, file, rows)))
     count = rows[POINTS].shape[0]
     state = together(comm, lambda: _state(file, arrays, note, simulation, count))
-    # the distribution of the file gives equal bits, except for sums in the order of messages
+    # the file's distribution of cells gives bitwise equal results, except for sums in the order of messages
     if len(boxes) == comm.size > 1 and (boxes != simulation.grid.partition.boxes).any():
         distribute_by(simulation, boxes)
     nodal = {name: simulation.grid.from_rows(*of) for name in NODAL if (of := getattr(state, name)) is not None}
@@ -164,7 +164,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return a dictionary from the names of arrays in the file to all arrays of a state."""
+    """Return all arrays of a state, by their names in the file."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -360,7 +360,7 @@ def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, 
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
-    """Raise ValueError if the stored motion in the last steps does not fit the points."""
+    """Raise ValueError if the stored rates of the last steps do not fit the points, see `Trend`."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
@@ -380,7 +380,7 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return all arrays of nested dictionaries in one: the entry ["a"]["b"] gets the name `prefix` + "a/b"."""
+    """Return one dictionary of all arrays in nested dictionaries: ["a"]["b"] gets the name `prefix` + "a/b"."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -402,12 +402,12 @@ def _complete(file: Path) -> Iterator[None]:
 
 
 def _numbered(name: str) -> str | None:
-    """Return the name of the array that numbers the rows of an array, or None if it has no numbers."""
+    """Return the name of the array that numbers the rows of the array `name`, or None if the rows have no numbers."""
     return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return for each array the rows (start, stop) to read here.  Raise ValueError if row numbers are invalid."""
+    """Return the rows (start, stop) of each array to read here.  Raise ValueError if row numbers are invalid."""
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
         first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))

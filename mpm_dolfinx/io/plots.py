@@ -78,7 +78,7 @@ def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     """Return the values (n,) of a field at the points of this process."""
     points, fields = simulation.points, {}
     if str(field).startswith(("porosity", "saturation", "effective_", "stress", "mean_", "deviatoric_")):
-        fields = fields_of_points(simulation)  # collective
+        fields = fields_of_points(simulation)  # all processes call this
     known: dict[str, Callable[[], Any]] = {
         "displacement": lambda: np.linalg.norm(points.displacement, axis=1),
         "displacement_x": lambda: points.displacement[:, 0],

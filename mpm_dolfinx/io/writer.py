@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-"""In 2 and 3 dimensions: VTK's cell type for a particle domain, and VTK's order of its corners."""
+"""VTK's cell type for particle domains in 2D and in 3D, and the order of their corners in VTK."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
 COUNTS = ("steps", "newton", "coupling", "cuts", "reinitialised", "balance", "residual", "wall")
 
@@ -76,8 +76,8 @@ class Writer:
     Raises
     ------
     ValueError
-        An argument has the wrong type.  Files in the folder are not from a writer, or have other columns.  The writer
-        is closed, or was created for another simulation or another time.
+        An argument has the wrong type.  Files in the folder are not from a writer, or have other columns than this run.
+        The writer is closed, or was created for another simulation or another time.
     OSError
         The folder is not writable, or the disk is full.  `run(..., after=simulation.result)` continues the run.
     """
@@ -356,7 +356,7 @@ class Series:
         return self.folder / f"{len(self.entries):06d}"
 
     def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
-        """Return a dictionary from the rank of each process with points to the path of its next file."""
+        """Return the path of the next file of each process with points, by rank."""
         names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
         names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
         return {rank: self.folder / name for rank, name in names.items()}

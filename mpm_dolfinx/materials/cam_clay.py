@@ -81,9 +81,9 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes of ln v against ln P, -, 0 < kappa < lambda_, with the specific volume v and the Kirchhoff stress P:
-        `lambda_` in first loading, `kappa` in unloading.  If v has the slope C against the logarithm of the Cauchy
-        stress, the slope of ln v against ln P is C / (v - C).
+        Slopes of ln v against ln P, -, 0 < kappa < lambda_: `lambda_` in first loading, and `kappa` in unloading.  Here
+        v is the specific volume, and P is the mean Kirchhoff pressure.  If v has the slope C against the logarithm of
+        the Cauchy stress, the slope of ln v against ln P is C / (v - C).
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
         in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
@@ -135,7 +135,7 @@ class ModifiedCamClay(Skeleton):
         else:
             bulk = -np.mean(stress, axis=-1) / kappa
             bulk = bulk if np.ndim(bulk) else _Follows(bulk)
-        if self.bulk is None or getattr(self.bulk, "follows", False):  # derived for another material before `replace`
+        if self.bulk is None or getattr(self.bulk, "follows", False):  # it was derived before `replace`
             object.__setattr__(self, "bulk", bulk)
         elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=SAME)):
             raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out; it is P_0 / kappa")
@@ -255,18 +255,18 @@ class BarcelonaBasic(ModifiedCamClay):
     Parameters
     ----------
     lambda_
-        Slope lambda(0) of saturated soil.
+        Slope lambda(0) of ln v against ln P in first loading of saturated soil.
     OCR
         Overconsolidation ratio, -, >= 1: initial size P_c of the yield surface, divided by the size of the yield
         surface that passes through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r
-        Ratio of lambda of very dry soil to lambda(0), -, > kappa / lambda_, <= 1.
+        Slope lambda of very dry soil divided by lambda(0), -, in (kappa / lambda_, 1].
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, usually 0.01 to 0.5 times the initial P_c0.
+        Reference stress P_r of the loading-collapse curve, Pa, > 0, usually 0.01 to 0.5 times the initial P_c0.
 
     Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables are `plastic`,
     `consolidated` = ln(P_c0 / initial P_c0), and `suction` and `suction_at_start`, in Pa.  Source: Alonso, Gens and
@@ -311,8 +311,8 @@ class BarcelonaBasic(ModifiedCamClay):
 class _Return:
     """Result of the return mapping for a value of the unknown d.
 
-    `compaction`: a, the plastic compaction divided by kappa.
-    `flow`: h = ln(Q_t / Q).
+    `compaction`: the unknown `a`, plastic compaction divided by kappa.
+    `flow`: h = ln(Q_t / Q), which depends on dgamma.
     `steepness`: w exp(-d), the square of Q / (M P) at the end of the step.
     `trial_pressure`: P_t, in Pa.
     `rho`: kappa / (lambda - kappa).

@@ -3,7 +3,7 @@
 
 Plasticity is multiplicative, in principal logarithmic strains.  The state is the inverse plastic metric C_p^-1.  With
 b = F C_p^-1 F^T, the trial elastic strain is eps = ln(b)/2.  Elasticity is Hencky's: the Kirchhoff stress is
-tau = K tr(eps) I + 2G dev eps.  The stress returns to the yield surface
+tau = K tr(eps) I + 2G dev eps.  The trial stress returns to the yield surface
 
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
@@ -41,7 +41,7 @@ Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the res
 
 @dataclass(frozen=True, kw_only=True)
 class DruckerPrager(Frictional):
-    """Hencky elasticity with a Drucker-Prager yield surface in Kirchhoff stress, perfectly plastic or hardening.
+    """Perfectly plastic or hardening law with Hencky elasticity, and with a Drucker-Prager cone in Kirchhoff stress.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class DruckerPrager(Frictional):
 
     @property
     def eta_flow(self):
-        """Coefficient of the pressure in the plastic potential, as eta in the yield function."""
+        """Coefficient of the pressure in the plastic potential: eta for the dilation angle."""
         return self._cone(self.dilation)[0]
 
     @staticmethod

@@ -182,7 +182,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
     try:
         law_of_F = expression(function, [shape], F=F, **given, **by_scene(grid))
         apply_derivatives(apply_algebra_lowering(ufl.diff(law_of_F, F)))  # here UFL detects sizes that disagree
-    except Exception:  # UFL has several kinds
+    except Exception:  # UFL raises several kinds of errors
         return False
     finally:
         log.disabled = before
@@ -219,8 +219,8 @@ Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the res
 class SoftnessAtPoints:
     """Softness of yielding points: elastic shear modulus divided by tangent shear modulus.
 
-    In plastic flow, volume strains and pressures may alternate from cell to cell.  The damping coefficient tau of
-    pressure jumps must then grow with the softness of the soil.
+    In plastic flow, volume strains and pressures may alternate from cell to cell.  The coefficient tau that damps
+    pressure jumps between cells must then grow with the softness of the soil.
 
     The deviatoric strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
     F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  In soil at rest, the direction
@@ -256,7 +256,7 @@ class SoftnessAtPoints:
         `at`: F, parameters and state of n points.
         `dF` (n, d, d): change of F in a step of length dt, in s.
         `shear` (n,), in Pa: elastic shear modulus.
-        `before` (n,): softness of the previous step.
+        `before` (n,): softness in the previous step.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -297,7 +297,7 @@ class ConductivityAtPieces:
         self._materials = materials
         self._u = displacement
         self.by_pressure = any("p" in signature(law).parameters for law in laws)
-        """Whether a law depends on the pore pressure p."""
+        """Whether any of the conductivity laws depends on the pore pressure p."""
         self._p = pressure
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 
@@ -342,7 +342,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three states of deformation, as stored in checkpoints."""
+    """Return a law's conductivities in three states of deformation, which checkpoints store."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -88,7 +88,7 @@ class SceneMaterials:
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
         def at_points() -> list[tuple[Skeleton, Skeleton]]:
-            """Return each used material twice: with values at this process's points, and at one point of the scene."""
+            """Return two copies of each used material: one for this process's points, and one for a single point."""
             return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
 
         evaluated, at_first = zip(*at_points(), strict=True)
@@ -132,7 +132,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """For checkpoints: checksums of varying constants, and samples of conductivity laws and retention curves."""
+        """For checkpoints: checksums of constants that vary, and samples of conductivity laws and retention curves."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -179,7 +179,7 @@ class SceneMaterials:
 
     @property
     def across(self) -> bool:
-        """Whether a law in plane strain receives the out-of-plane stretch of F-bar."""
+        """Whether any law of a scene in plane strain receives the out-of-plane stretch of F-bar."""
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
@@ -199,7 +199,7 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: has {has}; must define {allowed}")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
-            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have others")
+            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have other names")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         if self.fluid is None and m.retention is not None:
@@ -222,17 +222,17 @@ class SceneMaterials:
 
     def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
         if name in RESERVED or hasattr(FormPoints(self.grid), name):
-            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have others")
+            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have other names")
         other = self.shapes.setdefault(name, shape)
         if other != shape:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return law, integration points, and whether Q1 cells would lock without F-bar, for each part of the soil.
+        """Return the parts of the soil: their law, integration points, and whether Q1 cells would lock without F-bar.
 
         Materials form one part if they have the same law, and all or none of them are nearly incompressible.  If there
-        is only one part, its integration points are `pieces`.  Otherwise each part has its own points, with the fields
-        named in `common`, and with the law's parameters and state variables.
+        is only one part, its integration points are `pieces`.  If there are several parts, each has its own integration
+        points, with the fields named in `common`, and with the law's parameters and state variables.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -245,23 +245,23 @@ class SceneMaterials:
         return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index of the part that contains each point, see `parts`."""
+        """Return the index (n,) of the part of the soil to which each point belongs, see `parts`."""
         return self._part[points.material]
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return for each point the index of its law in `laws`."""
+        """Return the index (n,) of each point's law in the list `laws`."""
         return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether Q1 cells with its material would lock without F-bar."""
+        """Return a mask (n,) of the points in whose material Q1 cells would lock without F-bar."""
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether its law uses the out-of-plane stretch of F-bar."""
+        """Return a mask (n,) of the points whose law uses the out-of-plane stretch of F-bar."""
         return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether its law accepts an out-of-plane stretch."""
+        """Return a mask (n,) of the points whose law accepts an out-of-plane stretch."""
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -282,7 +282,7 @@ class SceneMaterials:
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return saturation S, dS/dp, Bishop's chi and relative permeability of points `of` at pressures p, in Pa."""
+        """Return S, dS/dp, Bishop's chi and k_r at pressures p, in Pa, for the points with the indices `of`."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -297,7 +297,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the result of `saturation` at pressures p, in Pa, for `rows` of the result of `retention_rows`."""
+        """Return `saturation` at the pressures p, in Pa.  `rows`: a row of `retention_rows` for each pressure."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -315,10 +315,10 @@ class SceneMaterials:
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return the values (n, ...) of a function of the material at the points.
+        """Evaluate a function of the material at each point, and return the values (n, ...).
 
-        The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  For a uniform
-        material without `columns`, the function may also return one value (...) for all points.
+        The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  If the
+        material is uniform and there are no `columns`, the function may also return one value (...) for all points.
 
         `columns` (n,): arguments of the function after the material, with one value for each point.
         """
@@ -335,7 +335,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the constants `named`, with updated constants that follow from them.
+        """Update all constants that follow from the changed constants `named`, and return the points.
 
         Raises
         ------
@@ -375,7 +375,7 @@ class SceneMaterials:
 
     @property
     def constants(self) -> dict[str, Skeleton]:
-        """For the name of each material constant in the scene: one material that has this constant."""
+        """Dictionary from the name of each material constant in the scene to one material that has this constant."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @cached_property
@@ -451,7 +451,7 @@ class SceneMaterials:
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether a state variable other than suction has changed by more than `EVOLVED`."""
+        """Return a mask (n,) of the points that have yielded, see `EVOLVED`.  Changes of suction are ignored."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = (law_of == number).nonzero()[0]
@@ -469,11 +469,11 @@ class SceneMaterials:
         return any(not law.state for law in self.laws)
 
     def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether its law is elastic, that is, has no state variables."""
+        """Return a mask (n,) of the points whose law is elastic, that is, has no state variables."""
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return (n, ...): material index, and constants that vary with position, without the initial stretch."""
+        """Return (n, ...): material index, and the constants that vary with position, except the initial stretch."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -485,7 +485,7 @@ class SceneMaterials:
         return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
 
     def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether its soil has yielded and has a dilation angle > 0."""
+        """Return a mask (n,) of the points whose soil has yielded and has a dilation angle > 0."""
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -565,7 +565,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return each law, the indices of its points, and the values that its forms need at these points."""
+        """Return triples: a law, the indices of its points, and the values that its forms need at these points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -603,7 +603,7 @@ def _by_place(m: Skeleton) -> list[str]:
 
 
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
-    """Return two copies of a material: with values at this process's points, and at the material's point of lowest id.
+    """Return two copies of a material: one for this process's points, and one for the material's point of lowest id.
 
     `X` (n, d), in m: reference positions of this process's points with the material.
     `ids` (n,): ids of these points.
@@ -629,8 +629,8 @@ def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> 
     for name in names:
         value, alone = getattr(all_points, name)[::2], getattr(half, name)
         if np.abs(value - alone).max() > SAME * np.abs(value).max():
-            what = f"{type(all_points).__name__}: {name}: values at positions depend on the other positions"
-            raise ValueError(f"{what}, must be a function of each position alone on several processes")
+            what = f"{type(all_points).__name__}: {name}: the value at a position depends on other positions"
+            raise ValueError(f"{what}, must depend on each position alone if there are several processes")
 
 
 def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ GIVEN = {
 
 @dataclass(frozen=True, kw_only=True)
 class Frictional(Skeleton):
-    """Base of laws for frictional soil, perfectly plastic or hardening.
+    """Base class of perfectly plastic and hardening laws for frictional soil.
 
     Parameters
     ----------

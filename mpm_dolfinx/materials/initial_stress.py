@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-LARGEST = 0.2  # limit to the change of a strain component in one iteration
+LARGEST = 0.2  # largest change of a strain component in one iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def lifted(self, materials: SceneMaterials, points: MaterialPoints) -> str:
-        """Return as text the stress and position of a point where K0 gives vertical tension, or "" without tension.
+        """Return a text: stress and position of a point where K0 gives vertical tension, or "" without tension.
 
         All processes must call this method.
         """
@@ -169,7 +169,7 @@ class InitialStresses:
         own = np.isin(np.searchsorted(self._start, points.id, side="right") - 1, kept)
         d = points.x.shape[1]
         vertical, pore = materials.effective_stress_3d(points)[:, d - 1, d - 1], materials.pore_stress(points)
-        rows = np.flatnonzero(own & (vertical > SAME * np.abs(pore)))[:1]  # beyond rounding errors
+        rows = np.flatnonzero(own & (vertical > SAME * np.abs(pore)))[:1]  # above rounding errors
         where = points.x + materials.grid.base
         return first(materials.grid.comm, "".join(f"{vertical[i]:.4g} Pa at {where[i].tolist()}" for i in rows))
 
@@ -220,9 +220,9 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return corners and unit weights of all particle domains in the vertical columns through given domains.
+    """Return corners and unit weights of all particle domains in the vertical columns that contain the given domains.
 
-    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: particle domains of this process.
+    `ids` (n,), `corners` (n, 2^d, d), in m, and `unit_weight` (n,), in N/m^3, of this process's particle domains.
     `above` (k, 2^d, d), in m: corners of the given domains of this process.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
@@ -272,7 +272,7 @@ class _ElasticStrains:
     materials: SceneMaterials
     points: MaterialPoints  # n points
     target: NDArray[np.float64]  # (n, 3, 3) stress, Pa
-    given: NDArray[np.bool_]  # (n,) whether the stress is a parameter
+    given: NDArray[np.bool_]  # (n,) whether the initial stress is a parameter of the law
     plastic: NDArray[np.bool_]  # (n,) whether C_p^-1 is a state variable
 
     @property
@@ -282,13 +282,13 @@ class _ElasticStrains:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """For each point and strain component, whether the component is unknown."""
+        """Whether each strain component of each point (n, components) is unknown."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
         out[:, 2] &= self.materials.knows_across(self.points)
         return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the components of tensors (n, 3, 3), with zeros at the components that are not unknown, see `free`."""
+        """Return the components of tensors (n, 3, 3), with zeros in place of known strains, see `free`."""
         i, j = np.array(self.components).T
         return np.where(self.free, tensor[:, i, j], 0.0)
 
@@ -336,7 +336,7 @@ class _ElasticStrains:
         return np.clip(strain - change, -1, 1)
 
     def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return the points with elastic strains, and for each point whether its stress differs from the target."""
+        """Return the points with elastic strains, and a mask (n,) of points whose stress differs from the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         close = SAME * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains

@@ -61,7 +61,7 @@ class LocalUnknowns:
     Attributes
     ----------
     values
-        UFL of the unknowns, by name, as functions of F; under the name `trial`, the trial values.
+        Dictionary of UFL: the unknowns as functions of F, by name, and the trial values under the name `trial`.
     known
         Like `values`, but the unknowns do not depend on F.  For laws with an energy, `known` equals `values`.
     """
@@ -189,13 +189,13 @@ class _Equations:
         return Solved(y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged on all processes if any point has failed."""
+        """Raise NotConverged on all processes if `failed` contains points on any process."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the local unknowns of a law with the numpy function `solution`."""
+        """Return the local unknowns that the law's numpy function `solution` computes."""
         n, k, values, start = *trial.shape, {}, 0
         for name, shape in self._trial.items():  # copies, because a law may change its arguments
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
@@ -282,7 +282,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    `system`: function that returns f, df/dy and the norms of f for point indices (r,) and their y (r, m).
+    `system`: function of point indices (r,) and their y (r, m) that returns f, df/dy and the norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
@@ -338,7 +338,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors by name from the components of a UFL vector."""
+    """Divide the components of a UFL vector among tensors, and return these by name."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

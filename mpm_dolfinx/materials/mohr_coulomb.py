@@ -13,8 +13,8 @@ e_i are the principal directions.
 The final stress lies on one of ten faces, edges and vertices of the yield surface.  On each face, edge and vertex, the
 final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).  Three
 conditions hold: the final stress is admissible, its principal stresses keep the order of the trial stresses, and
-plastic multipliers are >= 0.  The return mapping chooses the face, edge or vertex that violates these conditions least.
-Derivatives of the stress are exact, also for equal eigenvalues.
+plastic multipliers are >= 0.  The return mapping chooses the face, edge or vertex whose stress violates these
+conditions least.  Derivatives of the stress are exact, also for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NEVER = 1e6  # largest tensile strength, divided by the bulk modulus
 
 @dataclass(frozen=True, kw_only=True)
 class MohrCoulomb(Frictional):
-    """Hencky elasticity with Mohr and Coulomb's yield surface in Kirchhoff stress, perfectly plastic.
+    """Perfectly plastic law with Hencky elasticity, and with Mohr and Coulomb's yield surface in Kirchhoff stress.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """Yield surface in the space of ordered principal stresses."""
+    """The yield surface in the space of ordered principal stresses."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine
@@ -169,7 +169,7 @@ class _Surface:
 
 
 class _Return:
-    """Return mapping for ordered principal trial stresses outside the yield surface."""
+    """The return mapping of ordered principal trial stresses that are outside the yield surface."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
         self._trial = t

@@ -53,7 +53,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return the function of a law, evaluated at F F_i."""
+    """Return a function of F that evaluates `function`, a method of a law, at F F_i."""
     names = Skeleton.arguments_of(function)
 
     def of(**given):

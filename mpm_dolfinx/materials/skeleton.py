@@ -25,7 +25,7 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X are the points of one process.  The value at a point must not depend on other points, as a mean would.
+X contains the points of one process only.  The value at a point must not depend on other points, as a mean would.
 """
 
 BY_SCENE = ("dt", "cell_size")
@@ -107,10 +107,10 @@ class Skeleton:
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
         may also be a function without arguments that returns the array, called only for a tangent.  A missing
         derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  Newton's method
-        is slow if the derivative of `energy` with respect to the unknowns is not zero.
+        for the balances is slow if the derivative of `energy` with respect to the unknowns is not zero.
     trial
         Function of F that returns trial values as UFL, by name.  Residuals depend on F only through these values.
-        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` receive non-UFL trial values.
+        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` get trial values that are not UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     If a law receives the new state and dt = 0, it must return the stress at the end of the step.  The argument
@@ -374,7 +374,7 @@ def _deviatoric(F):
 
 
 def _stretch_difference(C):
-    """Return as UFL the difference of the logarithmic principal stretches for the tensor C = F^T F (2, 2)."""
+    """Return the difference of the logarithmic principal stretches for the tensor C = F^T F (2, 2), as UFL."""
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
     return (ufl.ln(1 + radius) - ufl.ln(1 - radius)) / 2
@@ -457,7 +457,8 @@ class unsaturated:
     Parameters
     ----------
     suction
-        Half width of the transition in p, Pa, > 0.  Recommended: 0.5 to 1 times unit weight of water times cell height.
+        Half the width, Pa, > 0, of the range of p in which the conductivity changes.  Recommended: 0.5 to 1 times unit
+        weight of water times cell height.
     least
         Conductivity of drained soil, divided by the conductivity of saturated soil, in (0, 1).
     specific_yield

@@ -44,8 +44,8 @@ class SofteningDruckerPrager(DruckerPrager):
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
     Other parameters: see `DruckerPrager`; `hardening` must be 0.  The state variable `plastic` is the inverse plastic
-    metric C_p^-1 (3, 3).  The state variable `hardened` is xi gamma, with the coefficient xi of the cohesion in the
-    yield function and the plastic shear strain gamma.  Soil in tension at the apex of the cone has the cohesion c_r.
+    metric C_p^-1 (3, 3).  The state variable `hardened` is xi gamma, where xi is the coefficient of the cohesion, and
+    gamma is the plastic shear strain.  Soil in tension at the apex of the cone has the cohesion c_r.
 
     Raises
     ------

@@ -19,7 +19,7 @@ from mpm_dolfinx.forms.axes import embedded, planar
 from mpm_dolfinx.materials.skeleton import _eigenvalues
 
 PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Indices of the components of a symmetric tensor, in plane strain or axisymmetry, and in 3D."""
+"""Indices of the components of a symmetric tensor: `PLANE` in plane strain and axisymmetry, `SPACE` in 3D."""
 
 
 class Isotropic:
@@ -31,7 +31,7 @@ class Isotropic:
         self._nodes = _eigenvalues(block, NEAR)
 
     def __call__(self, f: Callable):
-        """Return f(b) (3, 3) for a function of the eigenvalues."""
+        """Return the tensor f(b) (3, 3) for a function f of one eigenvalue."""
         b = self._b
         I = ufl.Identity(3)
         x = self._nodes
@@ -70,7 +70,7 @@ def components(b, plane: bool):
 
 
 def symmetric(values):
-    """Return the symmetric UFL tensor (3, 3) with six components in the order of `SPACE`."""
+    """Return the symmetric UFL tensor (3, 3) with the six components `values` in the order of `SPACE`."""
     place = {}
     for k, (i, j) in enumerate(SPACE):
         place[i, j] = place[j, i] = values[k]
@@ -102,7 +102,7 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class Coaxial:
     """Tensors (n, 3, 3) with the principal axes of n given tensors.
 
-    `x` (n, 3), `axes` (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
+    `x` (n, 3): eigenvalues of the given tensors.  `axes` (n, 3, 3): their principal axes, see `eigen`.
     `y` (n, 3): principal values of the new tensors.
     `plane`: whether the given tensors have only the components in `PLANE`.
     """

@@ -8,8 +8,8 @@ the start of the step.  Possible arguments of these functions are:
 points
     Quadrature points.  The integral of 1 over the measure `points.dx` is the volume of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is (3,
-    3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u; det F is
-    the volume ratio since seeding.  `points.position` is the position at the start of the step.
+    3), with f_r / r on the diagonal.  `points.F` is the deformation gradient at the start of the step, in the shape of
+    grad u; det F is the volume ratio since seeding.  `points.position` is the position at the start of the step.
     `points.displacement` is the displacement since the start of the run, or since a stage that reset it to zero.  Other
     attributes are the laws' state variables, and parameters that are functions of position.
 t
@@ -81,7 +81,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
     try:
         out = ufl.as_ufl(value)
         apply_algebra_lowering(out)  # here UFL detects most errors
-    except Exception as error:  # UFL has several kinds
+    except Exception as error:  # UFL raises several kinds of errors
         why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
         raise ValueError(f"{_name(function)}: returns {line(value)}{why}, must be {allowed}") from error
     if out.ufl_shape not in shapes:
@@ -115,7 +115,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
     for name, value in given.items():
         try:
             out[name] = ufl.as_ufl(value)
-        except Exception as error:  # UFL has several kinds
+        except Exception as error:  # UFL raises several kinds of errors
             raise ValueError(f"{what}: {name} = {line(value)}, must be UFL; the dict must have {allowed}") from error
         _check_parts(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
@@ -157,10 +157,10 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Replace errors of UFL and its compiler by a ValueError with the name `what` of the object."""
+    """Replace errors of UFL and its compiler by a ValueError that begins with the object's name, `what`."""
     try:
         yield
-    except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
+    except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds of errors; one is no Exception
         if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # OSError: a fault of the C compiler
             raise
         why = f"{type(error).__name__}: {line_of(error)}"

@@ -211,7 +211,7 @@ def sampled(law) -> list[float]:
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the value of a UFL function of the pressure at p, in Pa, as a number."""
+    """Return the number that a UFL function of the pressure has at the pressure p, in Pa."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
@@ -251,7 +251,7 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of a scene, as UFL expressions of fields at the integration points.
 
-    The points have the field `retention`.  The first entry of this field is the number of the kind of law (1, 2, ...),
+    The points have the field `retention`.  The first entry of this field is the number of the law's class (1, 2, ...),
     or 0 if the pores stay saturated.  The other entries are the constants of the law.  Pieces also have the field
     `lever`, the vector to the piece from the centroid of the material in its cell.  The pressure of a piece is the cell
     pressure plus the hydrostatic difference along `lever`.
@@ -339,7 +339,7 @@ def property_of(law, name: str, p):
 
 
 def _called(law, name: str, p):
-    """Return as UFL the result of the method `name` of a law."""
+    """Return the result of the method `name` of a law, as UFL."""
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
     if out.ufl_shape:
@@ -421,7 +421,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Smallest and largest tabulated suction, divided by `scale`.  Source: k_r outside is 1 or 0, exact to 1e-8."""
+"""Smallest and largest tabulated suction, divided by `scale`.  Source: k_r is 1 below, and 0 above, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, and twice this value by 2.6e-09.  Finer cells change it by 6.6e-03.

@@ -74,9 +74,9 @@ class Space:
     """Space of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
     `old`: w at the start of the step.
-    `past`: contribution of the rate in the previous substep to the change of w in the step.
+    `past`: part of the change of w in the step that the rate of the previous substep causes.
     `b`, `f`: residual and loads.
-    `same`: copy of w, which is constant in derivatives.
+    `same`: copy of w that derivatives of forms treat as a constant.
     `u`, `p`: displacement and scaled pressure, the parts of w.
     `p_dofs`: degrees of freedom of the pressures.
     `of_p`: space of the pressures alone.
@@ -104,7 +104,7 @@ class Forms(NamedTuple):
     dt: fem.Constant  # time weight of the flux, s
     since: fem.Constant  # time since the start of the step, s
     t: fem.Constant  # time at the end of the substep, s
-    # functions of time, each with the constant of its value
+    # functions of time, each with the UFL constant of its value
     given: list[tuple[Callable[[float], ArrayLike], fem.Constant]]
 
 
@@ -116,8 +116,8 @@ class BiotFEM:
     grid
         Mesh of the box-shaped body: a `Grid` with cells of equal size, which no other model uses.
     material, fluid
-        Skeleton whose law has no state variables and no local unknowns; pore fluid, or None.  With steep retention
-        curves (n > 2.5, or with an air entry), steps may fail to converge.
+        `material`: skeleton whose law has no state variables and no local unknowns.  `fluid`: pore fluid, or None.
+        With steep retention curves (n > 2.5, or with an air entry), steps may fail to converge.
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
@@ -208,7 +208,7 @@ class BiotFEM:
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
-        self.jit = time.perf_counter() - start  # s, to compile or load the forms
+        self.jit = time.perf_counter() - start  # time, in s, to compile or load the forms
         self._snes = self._solver()
 
     @property
@@ -286,7 +286,7 @@ class BiotFEM:
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
-        """Return as UFL the integral of `integrand` over the loaded or drained part of a side."""
+        """Return the integral of `integrand` over the loaded or drained part of a side, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
@@ -382,7 +382,7 @@ class BiotFEM:
         return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
-        """Return as UFL the change of the fluid content, multiplied by q, and the flux in the storage equation.
+        """Return the change of the fluid content, multiplied by q, and the flux in the storage equation, as UFL.
 
         `pull`: acceleration of gravity, in m/s^2.
         """
@@ -427,7 +427,7 @@ class BiotFEM:
         return self._whole * now + (1 - self._whole) * same
 
     def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
-        """Return as UFL the fluxes between cells and through drained sides.
+        """Return the fluxes between cells and through drained sides, as UFL.
 
         `weight` (d,), in 1/m: weight of the fluid per volume, divided by `scale`, or None.
         """
@@ -455,7 +455,7 @@ class BiotFEM:
         return flux
 
     def _solver(self) -> PETSc.SNES:
-        """Return Newton's method with full steps and a direct solver.
+        """Return PETSc's Newton solver, with full steps and a direct linear solver.
 
         A line search would be very slow for a rotating slender body, because linearised rotations stretch the body.
         """
@@ -634,11 +634,11 @@ class BiotFEM:
         return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return on every process the displacements (n, d), in m, at reference positions x (n, d), in m."""
+        """Return the displacements (n, d), in m, at reference positions x (n, d), in m, on every process."""
         return self._at(self._space.u, x, self.grid.dim)
 
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return on every process the pore pressures (n,), in Pa, at reference positions x (n, d), in m."""
+        """Return the pore pressures (n,), in Pa, at reference positions x (n, d), in m, on every process."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
@@ -649,7 +649,7 @@ class BiotFEM:
         return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-        """Return on every process the values of a function at reference positions."""
+        """Return the values of a function at reference positions x (n, d), on every process."""
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base

@@ -37,7 +37,7 @@ CUTS = 12  # largest number of halvings of a step
 
 @dataclass(frozen=True)
 class ElementTest:
-    """Results of an element test, as arrays with rows for the start and each step.
+    """Results of an element test, as arrays with one row for the start, and one row for each step.
 
     F, stress : (n, 3, 3)
         Deformation gradient F, and effective Cauchy stress in Pa, tension positive.
@@ -273,7 +273,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the sample after a step of dt, in s.  The stresses in the `free` components reach `goal`, in Pa."""
+        """Return the sample after a step of dt, in s.  The stress components `free` reach the values `goal`, in Pa."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T

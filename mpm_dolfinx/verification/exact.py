@@ -63,7 +63,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
     Parameters
     ----------
     z : (...), m, in [0, height]; distance from the drained end; z and t are broadcast
-    t : (...), s, > 0; time since the uniform pressure p0
+    t : (...), s, > 0; time since the pressure was p0 everywhere
     height : m, > 0; length of the layer
     cv : m²/s, > 0; coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
     p0 : Pa; pressure at t = 0+
@@ -101,10 +101,10 @@ class Mandel:
 
     Parameters
     ----------
-    a, b : m, > 0; width and height of the quarter, half the width and half the height of the slab
+    a, b : m, > 0; width and height of the quarter: half the width and half the height of the slab
     bulk, shear : Pa, > 0; drained moduli K (in three dimensions) and G
     mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
-    storage : 1/Pa, >= 0; S at constant strain, n/K_w + (alpha - n)/K_s
+    storage : 1/Pa, >= 0; storage coefficient S at constant strain, n/K_w + (alpha - n)/K_s
     alpha : in (0, 1]; Biot's coefficient
     force : N/m; resultant on the plate of width a, per metre of depth, positive in compression
 
@@ -188,7 +188,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, and its integral from 0 to x divided by a, in Pa."""
+        """Return the pressure, and its integral from 0 to x, divided by a; both in Pa."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
@@ -355,7 +355,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Return a function of arclength, for x, y, rotation and moment of a rod with length and bending stiffness 1."""
+    """Return a function of arclength: x, y, rotation and moment of a rod with length and bending stiffness 1."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 
@@ -369,7 +369,7 @@ def _rod(loads: Array, axial: float, shear: float):
     for part in np.linspace(0, 1, 1 + max(1, int(np.ceil(np.abs(loads).sum() / 2))))[1:]:
         solution = solve_bvp(slope, lambda a, b: np.append(a[:3], b[3]), s, state, tol=SAME, max_nodes=2**14)
         if not solution.success:
-            raise RuntimeError(f"rod under {part:.3g} of its load: {solution.message}")
+            raise RuntimeError(f"rod under {part:.3g} times its load: {solution.message}")
         s, state = solution.x, solution.y
     return solution.sol
 
