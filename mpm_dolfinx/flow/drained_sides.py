@@ -194,8 +194,8 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """Faces on all open sides.  This class replaces `OpenFaces` if at least one side has rain.
 
-    Through a face with rain, the outflow is minus the rain.  It is at least the outflow at the pressure of the pond,
-    and at most the outflow at the pressure `Rain.driest`.
+    Through a face with rain, the outflow is minus the rain, between two bounds: the outflow at the pressure of the
+    pond, and the outflow at the pressure `Rain.driest`.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain

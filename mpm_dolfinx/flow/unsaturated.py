@@ -118,8 +118,7 @@ class Relative:
     Attributes
     ----------
     shares
-        Fractions (DG0) of the saturated mobility of a cell due to soil without a retention curve, and due to each
-        curve.
+        Fractions (DG0) of a cell's saturated mobility: of soil without a retention curve, then of soil with each curve.
     laws
         Relative conductivities as functions of pressure.
     """
