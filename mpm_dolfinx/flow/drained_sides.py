@@ -234,7 +234,7 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    `sides`: faces of the open sides.  `sides.number` are indices in `names` and `ponds`.
+    `sides`: faces of the open sides.  `sides.number` is the index of the condition in `names` and `ponds`.
     `wet`: data of the substep.
     `names`: names of the conditions.
     `ponds`, m: largest depth of the pond of each condition, or None without rain.

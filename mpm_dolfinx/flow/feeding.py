@@ -93,7 +93,7 @@ class Feeds:
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
-        """Return the derivatives of the outflow with respect to cell pressures that `slope` omits, or None if zero."""
+        """Return the derivatives of the outflow that `slope` omits, with respect to cell pressures, or None if zero."""
 
     def settle(self, at: Any, fluid: Fluid) -> int:
         """Update the active set, and return the number of changes on this process."""

@@ -162,7 +162,7 @@ class MixedCells:
         """Return the flow paths of the mixed cells, see `Paths`.
 
         `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
-        `law` (m,): index of the retention curve of each piece, below `laws`.
+        `law` (m,): index of the retention curve of each piece, smaller than `laws`.
         `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None for zeros.
         """
         kappa, law = kappa[self._rows], law[self._rows]

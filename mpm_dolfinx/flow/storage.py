@@ -454,7 +454,7 @@ class StorageProblem:
 
     @property
     def _density(self) -> NDArray[np.float64]:
-        """Relative density of the fluid in the active owned cells at mid-step."""
+        """Density of the fluid in the active owned cells at mid-step, divided by its density at zero pressure."""
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 

@@ -186,7 +186,7 @@ class Relative:
         `cells` (m,): owned cells.
         `normal` (m, d): normals of the sides.
         `p` (m,), Pa: pressures in the cells.
-        `outer` (m,), Pa: pressures outside.
+        `outer` (m,), Pa: pressures outside the sides.
         `drop` (m,), Pa: pressure drop from the centroid to the face due to the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
