@@ -174,7 +174,7 @@ class Stage:
         return [one for acting in self.acting for one in acting.held]
 
     def supported(self, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return along which axes (d,) walls or conditions support the bodies.
+        """Return a mask (d,) of the axes along which walls or conditions support the bodies.
 
         `corners` (n, 2^d, d): corners of the domains.
         """
@@ -210,7 +210,7 @@ class Stage:
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces with conditions on displacements since seeding.  Their domains must not be replaced."""
+        """Faces of conditions that depend on displacements since seeding. Their domains must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property
