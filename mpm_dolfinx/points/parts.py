@@ -87,7 +87,7 @@ def relative(
 ) -> NDArray[np.float64]:
     """Return the norms divided by the scales.
 
-    The result is 0 for norms of at most `round_off`, and otherwise inf for scales of 0 and infinite norms.
+    Norms of at most `round_off` give 0.  All larger norms with a scale of 0, and infinite norms, give inf.
     """
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)

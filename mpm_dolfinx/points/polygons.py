@@ -139,7 +139,7 @@ class Polygons:
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
-        for first in range(3 if n == 6 else n):  # opposite starts divide hexagons alike
+        for first in range(3 if n == 6 else n):  # opposite first vertices divide hexagons alike
             rolled = np.roll(self.x, -first, axis=1)
             area = Polygons.rings(rolled[:, :size]).area
             least = np.minimum(area, whole - area)
