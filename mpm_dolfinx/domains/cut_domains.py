@@ -117,7 +117,7 @@ class CutDomains(Keyed):
         Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in standard
         MPM.
     second, faces
-        Whether to compute second moments of the pieces, and their areas on cell faces.
+        Whether to compute second moments of the pieces (`second`), and their areas on cell faces (`faces`).
     """
 
     def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False, faces: bool = True):
@@ -282,7 +282,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x.  For domains without a piece there, take the cell of the largest piece."""
+        """Return the cells of positions x, or of the largest piece if the domain has no piece in the cell of x."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

@@ -186,7 +186,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the values at the sites of a lattice, filtered along some axes; by default along all axes."""
+    """Return the values at the sites of a lattice, filtered along `axes`, by default along all axes."""
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:

@@ -235,7 +235,7 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return mobilities (n, d) along the axes, divided by `mean`, if the mobility varies gradually in each cell.
 
-    Along the gradient of the mobility, the mean over the cell is harmonic.  Normal to the gradient, it is arithmetic.
+    The mean over the cell is harmonic along the gradient of the mobility, and arithmetic normal to this gradient.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of their cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.

@@ -182,8 +182,8 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: means over each piece of products of two offsets from its centroid, see `Pieces`.  None if points have no
-        extent.
+        In 3D: products of two offsets from the centroid of a piece, as means over the piece, see `Pieces`.  None if
+        points have no extent.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None if points have no extent.
     """

@@ -49,7 +49,7 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the component of a Q1 field along `direction`, as a mean over points with the given moments."""
+            """Return the component along `direction` of a Q1 field w, as a mean over an area with the given moments."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2

@@ -353,7 +353,7 @@ class Mass:
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return the affine velocity field of each domain that is nearest to the field of the nodal velocities v."""
+        """Return affine velocity fields: in each domain, the field nearest to the field of the nodal velocities v."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)

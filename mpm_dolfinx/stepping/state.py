@@ -153,9 +153,9 @@ class State:
         Whether the next step is the first step of the stage.
     velocity : (unknowns,), m/s
         Nodal velocities in the last step on this process, with ghosts. In scenes with yield or contact, they give the
-        initial guess of Newton's method. None before the first step, and in other scenes.
+        initial guess of Newton's method. None before the first step, and in scenes with neither yield nor contact.
     trend
-        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in other
+        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in all other
         scenes, and after bodies were added.
     held : (unknowns,), N
         Additional nodal forces on this process, with ghosts, for equilibrium at the start of a stage. None without such
