@@ -337,7 +337,7 @@ class SideFeeds(Feeds):
         return out | {"runoff": {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return for each condition the rates (2,) of outflow and rain, in m^d/s."""
+        """Return the rates (2,) of outflow and rain for each condition, in m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

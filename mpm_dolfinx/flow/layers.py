@@ -84,7 +84,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return lines through the centroids of the pieces `rows`, crossed pieces, and their weights, for each axis.
+        """Return arrays for each axis: lines through centroids of `rows`, pieces that these lines cross, and weights.
 
         A crossed piece has a weight below one if the line runs along its border.
         """
@@ -214,7 +214,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return factors (n,) on pressure position shifts: 0 without inclined layers, >= 1 above slope `INCLINED`."""
+        """Return factors (n,) on the shifts of `_along`: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -38,7 +38,7 @@ from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
 """`BATCH`: number of points in a batch of element matrices, which fits into the processor's cache.  `MANY`: number of
-points in one evaluation of an expression.  If fewer than `MANY` remain, each takes `BATCH` points.
+points in one evaluation of an expression.  If fewer than `MANY` points remain, each evaluation takes `BATCH`.
 """
 
 

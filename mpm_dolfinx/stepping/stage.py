@@ -328,7 +328,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError for conditions that need inertia in a stage without it, or that inertia does not allow."""
+    """Raise ValueError if conditions need inertia and the stage has none, or if they do not allow its inertia."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
