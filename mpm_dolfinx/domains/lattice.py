@@ -123,7 +123,7 @@ class Lattice:
 
         `d` (n, 2^d, d), in m: displacements of the corners.
         `crossed` (n, 2^d): numbers of cells that the corners have crossed since the grid reset.
-        `parts` (k,): indices of corners without filter.
+        `parts` (k,): indices of corners that the filter does not move.
         """
         if self._count is None:
             return np.zeros_like(d)

@@ -260,9 +260,9 @@ def halved_pieces(
     """Return one piece for each half of a divided domain.  Its pressure follows from the mean slope in the domain.
 
     `pieces`: pieces of the n old points.
-    `points`: old points, and m new points.
+    `points`: the n old points and the m new points, as a pair.
     `into` (m,): old point of each new point.
-    `storage` (n,), (m,), in 1/Pa: storage coefficients of old points, and of new points.
+    `storage`, in 1/Pa: two arrays of storage coefficients, (n,) of old points and (m,) of new points.
     `bulk`, in Pa: bulk modulus of the fluid.
     """
     (old, new), n = points, len(points[0])

@@ -79,7 +79,7 @@ def faces_of_parts(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the parts of divided domains that lie on given faces of seeded domains.
 
-    `id`, `face` (m,): seeded domains and indices of their faces.
+    `id`, `face` (m,): identifiers of seeded domains, and indices of faces in these domains.
 
     Returns
     -------

@@ -152,7 +152,7 @@ class OpenSides:
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return c (m,), m^d/(Pa s), and q (m,), m^d/s, for the outflow `c pi - q` with the cell's mass potential pi.
 
-        `at` (m,): indices of the cells among the filled cells.
+        `at` (m,): index of the cell of each face among the filled cells.
         """
         shape = self.shape
         if flow.mobility.shift is not None:
