@@ -169,7 +169,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def shares(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Divide extensive quantities (n,) of points, such as volumes.  Return values (m,) of pieces in owned cells."""
+        """Divide extensive quantities (n,), such as volumes, among pieces.  Return values (m,) in owned cells."""
         return self.pieces_to_cells(self.pieces.fraction * values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

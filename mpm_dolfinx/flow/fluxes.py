@@ -188,7 +188,7 @@ class OpenSides:
         slots = (at[row] * out.shape[1] + axis) * 2 + end
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return sums of the values (faces,) over the faces at each cell, axis and end of the cell."""
+            """Return sums of the values over the faces at each end of each cell, along each axis."""
             return sum_by(slots, values, out[..., 0].size).reshape(out.shape[:3])
 
         whole = total(share)

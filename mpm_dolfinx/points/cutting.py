@@ -434,7 +434,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals of products of two coordinates over each piece, from the lower corner of its cell."""
+    """Return integrals of products x_a x_b over each piece, with x relative to the lower corner of its cell."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:

@@ -566,7 +566,7 @@ class Assembled(Keyed):
         for one in loads:
             of_cells = one.rounding(of_cells)
         own = cells[cells < grid.num_owned]
-        at_nodes = momentum.at_nodes(own, [of_cells[own, None]])[0] / 2 ** (grid.dim - 1)  # as for cells at a flat side
+        at_nodes = momentum.at_nodes(own, [of_cells[own, None]])[0] / 2 ** (grid.dim - 1)  # as in cells at a flat side
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
