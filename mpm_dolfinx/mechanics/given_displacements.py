@@ -297,7 +297,7 @@ class HoldLoads(Loads):
         self._lacked = np.full(1, np.inf)  # for each side of a connected part: sum of gaps in the last `augment`
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces to the multipliers of sides that lag behind. Return whether any force changed.
+        """Add the penalty forces to the multipliers of sides that lag behind.  Return whether any force changed.
 
         The updates end when one update leaves more than half of the mean gap of every side.
         """
@@ -352,7 +352,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return dofs and penalty forces. Forces at wall nodes are not reactions of walls, see `Loads.counted`."""
+        """Return dofs and penalty forces.  Forces at wall nodes are not reactions of walls, see `Loads.counted`."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

@@ -39,7 +39,7 @@ SHARE = 0.5
 
 Without this factor, dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees)
 does not reach a limit.  This load is 4.4 % too large with 9 cells over the width of the footing, and 3.4 % with 17
-cells. With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
+cells.  With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 """
 
 

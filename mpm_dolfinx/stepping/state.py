@@ -152,8 +152,8 @@ class State:
     begins
         Whether the next step is the first step of the stage.
     velocity : (unknowns,), m/s
-        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or contact, they give the
-        initial guess of Newton's method. None before the first step, and in scenes with neither yield nor contact.
+        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or quasi-static contact,
+        they give the initial guess of Newton's method. None before the first step, and in all other scenes.
     trend
         Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in all other
         scenes, and after bodies were added.
