@@ -117,7 +117,7 @@ class CutDomains(Keyed):
         Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in standard
         MPM.
     second, faces
-        Whether to compute second moments of the pieces, and their areas on cell faces.
+        Whether to compute second moments of the pieces (`second`), and their areas on cell faces (`faces`).
     """
 
     def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False, faces: bool = True):
@@ -169,7 +169,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def shares(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (m,) in the owned pieces of extensive quantities (n,) of points, such as volumes."""
+        """Divide extensive quantities (n,), such as volumes, among pieces.  Return values (m,) in owned cells."""
         return self.pieces_to_cells(self.pieces.fraction * values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -179,13 +179,13 @@ class CutDomains(Keyed):
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume mean (n, ...) of values (m, ...) of its pieces."""
+        """Return the volume-weighted mean (n, ...) of values (m, ...) over the pieces of each point."""
         columns = values.reshape(len(values), prod(values.shape[1:])).T
         means = sum_by(self.pieces.point, self.pieces.fraction * columns, len(self.points))
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the mean over its pieces, weighted by volume or, in axisymmetry, by meridional area."""
+        """Return means over the pieces of each point, weighted by volume or, in axisymmetry, by meridional area."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
@@ -290,12 +290,12 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic cells (n,) of positions x (n, d), in m, in the domains of points `at` (n,)."""
+        """Return the lexicographic index (n,) of the cell at x (n, d), in m, in the domain of each point `at` (n,)."""
         # rounding must not assign a corner on a grid line to a cell outside the domain
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x.  If a domain has no piece there, take the cell of its largest piece."""
+        """Return the cells of positions x, or of the largest piece if the domain has no piece in the cell of x."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

@@ -89,9 +89,9 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With F-bar, a piece has the mean volume ratio of its cell: a weighted geometric mean of two ratios: the volume ratio
-    of the domains from their corners, and det F of the points.  Without F-bar, and in cells with yielded soil, a piece
-    has the volume ratio of its point.
+    With F-bar, a piece has the volume ratio of its cell: the geometric mean of two ratios, weighted by `share`. One
+    ratio follows from the corners of the domains, and the other ratio is det F of the points.  Without F-bar, and in
+    cells with yielded soil, a piece has the volume ratio of its point.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.

@@ -54,7 +54,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index that returns the neighbours' values and face centres, and which exist.
+        """Return a function of a face index for values and face centres of neighbours, and which neighbours exist.
 
         `own` (c, k): c values of each of k points.
         `faces`: centres (d, k), in m, of the faces of the points, for each face index.
@@ -92,7 +92,7 @@ class LinearGradients:
 
 
 def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return a key for each face of seeded domains.  Both domains at a face have the same key."""
+    """Return integers (keys) that identify each face of seeded domains.  Both domains at a face have the same key."""
     dim, starts = bodies[0].dim, np.cumsum([0, *map(len, bodies)])
     of, key = np.where(seeded, body_of(ids, starts), -1), np.zeros((len(ids), 2 * dim), dtype=np.int64)
     for i, body in enumerate(bodies):
@@ -108,7 +108,7 @@ def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArra
 def _faces_of_parts(
     comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, seeded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return a key for each face of domains and of parts of domains.  Both domains at a face have the same key.
+    """Return a key for each face, also of parts of domains.  Both domains at a face have the same key.
 
     `seeded`: keys of the faces of whole domains, for bodies without a lattice.
     """
@@ -135,7 +135,7 @@ def _faces_of_parts(
 
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each row of keys the index of the identical other row, or -1."""
+    """Return the index of the other row that is identical to each row of keys, or -1 without such a row."""
     order, out = np.lexsort(key.T), np.full(len(key), -1)
     same = np.logical_and.reduce(key[order[1:]] == key[order[:-1]], axis=1).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]

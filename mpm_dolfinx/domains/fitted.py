@@ -63,7 +63,7 @@ def fitted_at(
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return index pairs of `places` and points x at a distance below `radius` along each axis."""
+    """Return pairs of indices, one in `places` and one in x, of positions closer than `radius` along each axis."""
     low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))

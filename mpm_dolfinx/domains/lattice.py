@@ -123,7 +123,7 @@ class Lattice:
 
         `d` (n, 2^d, d), in m: displacements of the corners.
         `crossed` (n, 2^d): numbers of cells that the corners have crossed since the grid reset.
-        `parts` (k,): indices of corners without filter.
+        `parts` (k,): indices of corners that the filter does not move.
         """
         if self._count is None:
             return np.zeros_like(d)
@@ -133,7 +133,7 @@ class Lattice:
             number, values = np.append(number, parts), np.pad(values, ((0, len(parts)), (0, 0)), constant_values=np.nan)
         where = comm, tuple(np.add(self._count, 1)), number
         field, layers, to_rows = _at_sites(*where, values, self._tolerance)
-        del values  # as large as the corners
+        del values  # frees an array as large as the corners
         thirds = self._thirds and [self._thirds[0][:, layers], *self._thirds[1:]]
         change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
         change[np.isnan(change)] = 0.0
@@ -149,7 +149,7 @@ def _at_sites(
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """Return the values at the lattice sites of this process, its layers, and a function from sites to corners.
+    """Return values at lattice sites of this process, its layers, and a function that copies site values to corners.
 
     The layers of the lattice are distributed over the processes.  A site has the mean value of its corners, or nan if a
     value differs from the mean by more than `tolerance`.
@@ -191,7 +191,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the values at the sites of a lattice, filtered along some axes; by default along all axes."""
+    """Return the values at the sites of a lattice, filtered along `axes`, by default along all axes."""
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:

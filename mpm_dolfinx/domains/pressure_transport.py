@@ -196,7 +196,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return for each cell the largest factor (n,) <= 1 that keeps its increments within [`low`, `high`]."""
+    """Return the largest factor (n,) <= 1 on the increments of each cell that keeps them within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -242,7 +242,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return for each piece the largest factor on its correction that keeps its domain's pressures in bounds."""
+    """Return the largest factor on the correction of each piece that keeps the pressures of its domain in bounds."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
@@ -260,9 +260,9 @@ def halved_pieces(
     """Return one piece for each half of a divided domain.  Its pressure follows from the mean slope in the domain.
 
     `pieces`: pieces of the n old points.
-    `points`: old points, and m new points.
+    `points`: the n old points and the m new points, as a pair.
     `into` (m,): old point of each new point.
-    `storage` (n,), (m,), in 1/Pa: storage coefficients of old points, and of new points.
+    `storage`, in 1/Pa: two arrays of storage coefficients, (n,) of old points and (m,) of new points.
     `bulk`, in Pa: bulk modulus of the fluid.
     """
     (old, new), n = points, len(points[0])

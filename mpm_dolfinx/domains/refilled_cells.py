@@ -106,7 +106,7 @@ class RefilledCells:
     `flowed` (n,): whether the domains of points may be renewed.
     `needs` (n,): whether the domains of points need renewal.
     `faces`: surface of the bodies.
-    `signs`: keys of seeded faces, and for each face the index of its set of conditions.
+    `signs`: keys of seeded faces, and the index of the set of conditions on each of these faces.
     `second`: whether to compute second moments of the pieces.
     """
 
@@ -296,14 +296,14 @@ class RefilledCells:
         parent[at, face], ends[at, face] = key, X
         middle = self._place(cells[at], ((lower + upper) / 2)[:, None])[:, 0]
         edge = np.linalg.norm(upper - lower, axis=1) * ring_lengths(self.grid, middle)
-        total = sum_by(cells[at], edge, self.cells)  # of all new edges on the surface
+        total = sum_by(cells[at], edge, self.cells)  # length of all new edges on the surface
         area[at, face] = edge / total[cells[at]] * whole[cells[at]]
         return self._partial(cells, local, parent, area, ends)
 
     def _nearest(
         self, parts: Parts, cells: NDArray[np.int64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return for new edges the keys of the nearest seeded faces, and the reference positions of both ends.
+        """Return the key of the seeded face nearest to each new edge, and the reference positions of the edge's ends.
 
         `parts`: parts of the old surface, ordered by cell.
         """
@@ -418,7 +418,7 @@ class RefilledCells:
         row, quads, edge = replace(polygons, x=inside).simplified(near).quadrilaterals()
         piece = left[of[row]]
         large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
-        large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # crumbs change no numbers
+        large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # as if there were no crumbs
         piece, quads, edge = (values[large] for values in (piece, quads, edge))
         left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
@@ -458,7 +458,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """For each piece of removed domains: index, receiving group of new domains, and fraction of the old mass."""
+        """Indices of pieces of removed domains, receiving groups of new domains, and fractions of the old mass."""
         pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, outside])
@@ -487,7 +487,7 @@ class RefilledCells:
     def on_faces(
         self, values: NDArray[np.float64], parent: NDArray[np.int64], group: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return point data (n, ...) of new domains at surfaces: means over the cell's old surface, otherwise 0."""
+        """Return point data (n, ...) of new domains: means over old surfaces in their cells, or 0 without a surface."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]

@@ -79,7 +79,7 @@ def faces_of_parts(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the parts of divided domains that lie on given faces of seeded domains.
 
-    `id`, `face` (m,): seeded domains and indices of their faces.
+    `id`, `face` (m,): identifiers of seeded domains, and indices of faces in these domains.
 
     Returns
     -------
@@ -214,7 +214,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of parts, areas of faces and face indices (n,), replaced by those of renewed faces."""
+        """Replace areas of parts, areas of faces and face indices (n,) by values of renewed faces, and return them."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))

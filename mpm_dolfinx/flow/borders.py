@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes in unsaturated soil through faces between cells of different soil, and faces of cells with several soils.
+"""Fluxes in unsaturated soil through faces of cells with several soils, and faces between cells of different soil.
 
 `series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL (`fluxes`).
 """
@@ -28,7 +28,7 @@ class Borders:
     """Faces between cells of different soil, and faces of cells with several soils, at the last grid reset.
 
     `cells` (m,): cell of each piece.
-    `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
+    `soils` (m, k): numbers that identify the soil of each piece.  Equal rows mean equal conductivities.
     `law` (m,): index of the retention curve of each piece.
     `facets`: facets of this process between two active cells.
     `mixed`: cells with several soils, or None.
@@ -105,7 +105,7 @@ class Borders:
         ]
         lengths = [np.maximum(length, EPSILON * edge) for length, edge in zip(lengths, across, strict=True)]
         shift = moved + places - contents.centroid
-        drift = (shift[other] - shift[first]) / 2  # the face moves with the mean of both cells
+        drift = (shift[other] - shift[first]) / 2  # the face moves by the mean displacement of both cells
         offsets = [
             across[i][:, None] / 2 * unit - sign * contents.centroid[cells] + drift
             for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
@@ -126,7 +126,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices (k,) of open faces of owned mixed cells, and their results of `Relative.through_sides`."""
+        """Yield indices (k,) of open faces of owned mixed cells, and `Relative.through_sides` for these faces."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -172,7 +172,7 @@ class BorderFaces:
         """Return the fluxes through the faces.
 
         `p` (2, m), Pa: pressures on both sides of each face.
-        `force` (c, d), N/m^3: inertia force in local cells.
+        `force` (c, d), N/m^3: inertia force on the fluid in the local cells.
         """
         weight = (
             self.weight

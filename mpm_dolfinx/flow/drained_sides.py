@@ -194,8 +194,8 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """Faces on all open sides.  This class replaces `OpenFaces` if at least one side has rain.
 
-    Through a face with rain, the outflow is minus the rain.  It is at least the outflow at the pressure of the pond,
-    and at most the outflow at the pressure `Rain.driest`.
+    Through a face with rain, the outflow is minus the rain, between two bounds: the outflow at the pressure of the
+    pond, and the outflow at the pressure `Rain.driest`.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -234,7 +234,7 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    `sides`: faces of the open sides.  `sides.number` are indices in `names` and `ponds`.
+    `sides`: faces of the open sides.  `sides.number` is the index of the condition in `names` and `ponds`.
     `wet`: data of the substep.
     `names`: names of the conditions.
     `ponds`, m: largest depth of the pond of each condition, or None without rain.
@@ -337,7 +337,7 @@ class SideFeeds(Feeds):
         return out | {"runoff": {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return for each condition the rates (2,) of outflow and rain, in m^d/s."""
+        """Return the rates (2,) of outflow and rain for each condition, in m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

@@ -93,7 +93,7 @@ class Feeds:
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
-        """Return the derivatives of the outflow with respect to cell pressures that `slope` omits, or None if zero."""
+        """Return the derivatives of the outflow that `slope` omits, with respect to cell pressures, or None if zero."""
 
     def settle(self, at: Any, fluid: Fluid) -> int:
         """Update the active set, and return the number of changes on this process."""
@@ -114,7 +114,7 @@ class Feeds:
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return volumes (m^d) since the start of the conditions, by quantity and condition.
 
-        `rates`, `seconds` (s): results of `passing` in the substeps of a step, and time weights of these substeps.
+        `rates`: results of `passing` in the substeps of a step.  `seconds`, s: time weights of these substeps.
         """
         return {}
 
@@ -147,5 +147,5 @@ class Feeding:
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return placeholders for `Feeds.outcome` before the first step: zero for volumes, `value` for all others."""
+        """Return placeholders for `Feeds.outcome` before the first step: zero for volumes, otherwise `value`."""
         return {}

@@ -34,8 +34,8 @@ from mpm_dolfinx.points.material_points import cofactor, determinant
 THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
-A convex body has the volume V, and is inside a cell of edge length h.  A plane outside this body has a distance of at
-least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  Smaller distances are replaced by this bound.
+Let V be the volume of a convex body inside a cell of edge length h.  A plane outside this body has a distance of at
+least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  This bound replaces smaller distances of faces.
 """
 ALONG = 0.1
 """A drained side determines the pressure slope along axes on which its unit normal has a component above this value.
@@ -101,7 +101,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return ratios (m,): distance of faces from centroids, divided by distance from pressure positions (`layers`).
+        """Return ratios (m,): face distance from the centroid, divided by that from the pressure position (`layers`).
 
         `normal` (m, d): normals of the faces.
         `offset` (m, d), m: vectors from the centroids to the faces.
@@ -115,7 +115,7 @@ class Conduction:
         return mean_density(p, other, self.bulk)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map vectors (m, d) in cells `at` by the deformation gradients of these cells."""
+        """Multiply vectors (m, d) in cells `at` by the deformation gradients of these cells."""
         return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 
@@ -152,7 +152,7 @@ class OpenSides:
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return c (m,), m^d/(Pa s), and q (m,), m^d/s, for the outflow `c pi - q` with the cell's mass potential pi.
 
-        `at` (m,): indices of the cells among the filled cells.
+        `at` (m,): index of the cell of each face among the filled cells.
         """
         shape = self.shape
         if flow.mobility.shift is not None:
@@ -188,7 +188,7 @@ class OpenSides:
         slots = (at[row] * out.shape[1] + axis) * 2 + end
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return the sum of the values at each cell, axis and end."""
+            """Return sums of the values over the faces at each end of each cell, along each axis."""
             return sum_by(slots, values, out[..., 0].size).reshape(out.shape[:3])
 
         whole = total(share)
@@ -226,7 +226,7 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """`weight` (m,): volumes of pieces, m^d.  `area` (m,): the same, in axisymmetry areas of sections, m^2."""
+        """`weight` (m,): volumes of pieces, m^d.  `area` (m,): `weight`, or in axisymmetry areas of sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
@@ -259,7 +259,7 @@ class CellContents(Keyed):
         return sum_by(self._at, values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each filled cell the largest `softness` of its pieces, at least 1, see `StorageProblem`."""
+        """Return the largest `softness` (see `StorageProblem`) of the pieces in each filled cell, at least 1."""
         softest = np.ones(len(self.filled))
         np.maximum.at(softest, self._at, softness)
         return softest
@@ -350,7 +350,7 @@ class HalfFaces:
 
     @cached_property
     def at(self) -> NDArray[np.int64]:
-        """Indices (m,) of the cells among the filled cells."""
+        """Index (m,) of each face's cell among the filled cells."""
         return self.contents.slot(self.cells)
 
     @cached_property
@@ -496,7 +496,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return the derivative of the transmissibility T with respect to one k_r."""
+                    """Return the derivative of the transmissibility T with respect to k, one of the values of k_r."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )

@@ -56,7 +56,7 @@ class MixedCells:
     `low`, `high`: corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
     `x`: centroids (m, d) of the pieces, in cell coordinates.
     `volume`: volumes (m,) of the pieces, m^d.
-    `soils` (m, k): material constants.  Pieces with equal rows have equal conductivities.
+    `soils` (m, k): material constants.  Pieces with identical constants have equal conductivities.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -84,7 +84,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis the lines through the centroids of pieces `rows`, the pieces they cross, and weights.
+        """Return arrays for each axis: lines through centroids of `rows`, pieces that these lines cross, and weights.
 
         A crossed piece has a weight below one if the line runs along its border.
         """
@@ -103,7 +103,7 @@ class MixedCells:
             a, b = (piece[kept][rows] for rows in (one, other))
             overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
             overlap = overlap.clip(0) / np.maximum(high[a] - low[a], NEAR)
-            # boxes of pieces side by side may overlap after deformation: on a line in both, each counts half
+            # boxes of neighbouring pieces may overlap after deformation: if a line crosses both, each counts half
             lateral = 1 - np.delete(overlap, axis, axis=1).min(axis=1)
             counted = fraction + sum_by(one, lateral * fraction[other] * overlap[:, axis], len(lines))
             out.append((lines, piece[kept], fraction / np.maximum(counted, 1.0)))
@@ -133,7 +133,7 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the mobilities along the axes, and the shifts of the pressure position divided by the cell size.
+        """Return mobilities along the axes, and shifts of pressure positions from centroids, divided by the cell size.
 
         `mean`: 1 if all layers shift the pressure position, 0 if only inclined layers shift it.
         """
@@ -162,7 +162,7 @@ class MixedCells:
         """Return the flow paths of the mixed cells, see `Paths`.
 
         `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
-        `law` (m,): index of the retention curve of each piece, below `laws`.
+        `law` (m,): index of the retention curve of each piece, smaller than `laws`.
         `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None for zeros.
         """
         kappa, law = kappa[self._rows], law[self._rows]
@@ -176,7 +176,7 @@ class MixedCells:
         """Return the flow paths along an axis from the pressure positions to one end of the cells."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
-        length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part between position and end
+        length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part beyond the pressure position
         kept = np.flatnonzero(length > SAME)
         kept = kept[np.lexsort((middle[kept], lines.line[kept]))]
         line, piece = lines.line[kept], lines.piece[kept]
@@ -214,7 +214,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a factor (n,) on pressure shifts in cells: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
+        """Return factors (n,) on the shifts of `_along`: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,17 +233,17 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobilities (n, d) along the axes, divided by `mean`, of soil whose mobility varies gradually in cells.
+    """Return mobilities (n, d) along the axes, divided by `mean`, if the mobility varies gradually in each cell.
 
-    Along the gradient of the mobility, the mean over the cell is harmonic.  Normal to the gradient, it is arithmetic.
+    The mean over the cell is harmonic along the gradient of the mobility, and arithmetic normal to this gradient.
 
-    `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
+    `offset` (m, d), m: positions of the pieces relative to the midpoints of their cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.
     `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
-    parts = []  # part of the variance explained by a linear variation along each axis
+    parts = []  # fraction of the variance that a linear variation along each axis explains
     for x, least in zip(offset.T, (NEAR * contents.grid.sizes(contents.filled).T) ** 2, strict=True):
         middle, moment = contents.mean(x), contents.mean(x * kappa)
         variance = contents.mean(x**2) - middle**2
@@ -259,13 +259,13 @@ def graded(
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
     """Return the owned cells with pieces of different conductivity, or None if no process has a mixed cell.
 
-    `soils` (m, k): material constants.  Pieces with equal rows have equal conductivities.
+    `soils` (m, k): material constants.  Pieces with identical constants have equal conductivities.
     """
     grid = cut.grid
     cells = cut.cells
     volume = contents.area
     some = np.zeros((grid.num_local, soils.shape[1]))
-    some[cells] = soils  # numbers of one piece of the cell
+    some[cells] = soils  # constants of an arbitrary piece of the cell
     mixed = sum_by(cells, (soils != some[cells]).any(axis=1), grid.num_local) > 0
     corners = cut.points.corners
     low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))

@@ -8,8 +8,8 @@ the unit weight of the fluid.  The corrected flux is (see `storage` for other sy
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
-At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the vector along the side, from the
-projection of the centroid onto the side to the centre of the face.
+At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  The centroid is projected onto the side.  Here t
+points from this projection to the centre of the face on the side.
 
 The gradients are a least-squares fit to the pressures of neighbouring cells and drained sides, and to zero flow through
 other sides.  A neighbour that conducts less than the cell has a smaller weight in the fit.  The fit is exact for linear
@@ -91,7 +91,7 @@ class Gradients:
         off = np.abs(along / h.reshape(-1, 1, d)).max(axis=(1, 2)) > ALONG / 2
         off[at[off_middle(sides, grid)]] = True
         self.rows = rows = np.flatnonzero(off)
-        """Indices of the cells that need the correction, among the filled cells."""
+        """Indices, among the filled cells, of the cells that need the correction."""
         distance = grid.between(contents.filled[:, None], cells, towards)
         separation[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * distance
         self._own = contents.filled[rows]
@@ -212,5 +212,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return the vectors along faces, from the projections of the centroids to the centres of the faces."""
+    """Return vectors along faces: from the centroid, projected onto the face, to the centre of the face."""
     return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

@@ -33,7 +33,8 @@ def second_differences(
     """Return the matrix H.  The sparsity pattern of H depends on the active cells only.
 
     `unknowns`: pressure unknowns of the active cells.
-    `strength` (n, d), m^d/Pa: 4 w / f >= 0 of owned active cells along each axis, with the smaller `opening` f.
+    `strength` (n, d), m^d/Pa: 4 w / f, >= 0, of each owned active cell along each axis.  Here f is the smallest
+    `opening` at the two faces normal to this axis.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
     `opening` (c, d, 2): fractions of the lower and upper faces of the local cells that material covers, in axisymmetry
     times the circumference.

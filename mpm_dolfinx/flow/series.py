@@ -30,8 +30,8 @@ class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces.
 
     The first three indices of the arrays (n, d, 2, ...) are the cell, the axis, and the end of the cell.  `parallel` is
-    for lines with a single soil.  Its entry 0 is for soil without a retention curve, and each curve has one further
-    entry.  The fields `law`, `length` and `resistance` describe one line with s soils in series.
+    for lines with a single soil.  Entry 0 of `parallel` is for soil without a retention curve, and each curve has one
+    further entry.  The fields `law`, `length` and `resistance` describe one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
@@ -44,7 +44,7 @@ class Paths(NamedTuple):
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
-        """Return the paths (n, ...), repeated for both ends of all axes."""
+        """Return the paths (n, d, 2, ...): each of these n paths, repeated for both ends of all axes."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
@@ -110,7 +110,7 @@ def through(
     `p` (m,), Pa: pressures on both sides, as two arrays.
     `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
     `lengths` (m,), m: lengths of the paths.
-    `drops` (m,), Pa: pressure drops due to the weight of the fluid along each path, from the first to the second side.
+    `drops` (m,), Pa: pressure drops along the paths, from the first to the second side, due to the weight of the fluid.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -134,7 +134,7 @@ class _Chain:
         for side, path in enumerate(paths):
             first, drop = len(hydrostatic) - 1, drops[side]
             for j in range(count[side]):
-                slot = count[side] - 1 - j if side else j  # the second path is listed from the cell to the face
+                slot = count[side] - 1 - j if side else j  # soils of the second path: from the cell to the face
                 used = path.law[:, slot] >= 0
                 part = np.where(used, path.length[:, slot], 1.0) * drop
                 with np.errstate(divide="ignore"):
@@ -151,7 +151,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return the conductance between both ends of the path, and the slopes of `Through`."""
+        """Return the values of `Through`, as rows (3, faces): conductance, then both slopes."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)

@@ -169,7 +169,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return for each cell the storage (m^d/Pa) by drainage, and `int S d(chi p)/dp dV` (m^d) with saturation S."""
+        """Return the storage by drainage (m^d/Pa) and `int S d(chi p)/dp dV` (m^d) of each cell, with saturation S."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -221,7 +221,7 @@ class StorageSystem:
     `cells`: active local cells, including ghosts.  `facets`: faces between two of these cells.
     `momentum`: unknowns of the displacement.
     `parts`: connected parts of the bodies.
-    `joins`: functions that return the pattern of couplings of cell pressures, see `Loads.joins`.
+    `joins`: functions that return the sparsity pattern of couplings between cell pressures, see `Loads.joins`.
     """
 
     def __init__(
@@ -240,7 +240,7 @@ class StorageSystem:
         fluxes = forms.fluxes
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), (grid.midpoints, grid.near_others[1]))
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
-        """Connected part of the bodies to which each unknown belongs."""
+        """Connected part of the bodies that contains each unknown."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.moves = moves = fluxes.by_motion is not None
         """Whether the matrix B contains the derivative of the outflow due to inertia, see `set_by_motion`."""
@@ -282,7 +282,7 @@ class StorageSystem:
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
         """Set `out` to the change (m^d) of the residual due to an increment u.
 
-        `slopes`: functions that return changes of outflow volumes at fixed accelerations.
+        `slopes`: functions that return the changes of outflow volumes due to u, at fixed accelerations.
         """
         self.B.mult(u, out)
         for slope in slopes:
@@ -353,7 +353,7 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Residuals of the fluid balance in the cells, and sums (parts,) over the connected parts, in m^d."""
+    """Residuals of the fluid balance in the cells, and sums (parts,) over the cells of each connected part, in m^d."""
 
     vector: PETSc.Vec
     exchanged: NDArray[np.float64]  # sum of absolute changes of content and of sources
@@ -379,7 +379,7 @@ class StorageProblem:
     `system`: vectors and matrices, with the assembled fluxes.
     `flow`: function that assembles the outflow at (u, p).  Its argument is True at the start of a substep.
     `dt`: time weight, s, of the outflow rate at (u, p).
-    `before`: outflow volumes from the rate of the previous substep.
+    `before`: contribution of the previous substep's rates to the outflow volumes.
     `softness` (m,): ratio of elastic to tangent shear modulus of the pieces, 1 if no law can yield.
     `defect` (n,), m^d: correction of volume defects in the active owned cells by the end of the substep.
     `inertial`: inertia of the bodies, or None.
@@ -454,7 +454,7 @@ class StorageProblem:
 
     @property
     def _density(self) -> NDArray[np.float64]:
-        """Relative density of the fluid in the active owned cells at mid-step."""
+        """Density of the fluid in the active owned cells at mid-step, divided by its density at zero pressure."""
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
@@ -495,7 +495,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content due to pressure errors (Pa), and its absolute changes in the step."""
+        """Return water content errors due to pressure errors (Pa), and absolute water content changes in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -594,7 +594,7 @@ class StorageProblem:
         rates, dt = self._rates(outflow), self.dt
         mass = r.array_r + dt * rates.cells + before.cells
         r.array_w[:] = mass / density
-        # bound of the rounding errors of volumes, and of opposite fluxes
+        # bound of the rounding errors of volumes, and of fluxes that cancel
         round_off = 8 * EPSILON * (self._contents.volume + dt * rates.turnover + before.turnover)
         exchanged, gain = np.abs(change) + dt * rates.gain + before.gain, change + dt * rates.net + before.net
         rows = exchanged, round_off, np.abs(mass), gain
@@ -688,7 +688,7 @@ class StorageProblem:
         Parameters
         ----------
         factor
-            Multiple of beta, >= 0.
+            Factor on beta, >= 0.
         share
             Weight of L, in [0, 1].  For a checkerboard pressure, `beta V - L` is zero.  L is the sum of
             `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.

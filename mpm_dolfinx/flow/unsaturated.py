@@ -118,8 +118,7 @@ class Relative:
     Attributes
     ----------
     shares
-        Fractions (DG0) of the saturated mobility of a cell due to soil without a retention curve, and due to each
-        curve.
+        Fractions (DG0) of a cell's saturated mobility: of soil without a retention curve, then of soil with each curve.
     laws
         Relative conductivities as functions of pressure.
     """
@@ -187,7 +186,7 @@ class Relative:
         `cells` (m,): owned cells.
         `normal` (m, d): normals of the sides.
         `p` (m,), Pa: pressures in the cells.
-        `outer` (m,), Pa: pressures outside.
+        `outer` (m,), Pa: pressures outside the sides.
         `drop` (m,), Pa: pressure drop from the centroid to the face due to the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]

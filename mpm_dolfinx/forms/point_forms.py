@@ -38,7 +38,7 @@ from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
 """`BATCH`: number of points in a batch of element matrices, which fits into the processor's cache.  `MANY`: number of
-points in one evaluation of an expression.  If fewer points remain, each evaluation takes `BATCH` points.
+points in one evaluation of an expression.  If fewer than `MANY` points remain, each evaluation takes `BATCH`.
 """
 
 
@@ -182,8 +182,8 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: means over each piece of products of two offsets from its centroid, see `Pieces`.  None if points have no
-        extent.
+        In 3D: products of two offsets from the centroid of a piece, as means over the piece, see `Pieces`.  None if
+        points have no extent.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None if points have no extent.
     """
@@ -215,7 +215,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Two arrays: all dofs of Q1 vectors in cells with points, and the indices of each cell's dofs among them."""
+        """Dofs (n,) of Q1 vectors in all cells with points, and indices in this array of the dofs of each cell."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))

@@ -151,7 +151,7 @@ def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `rows`, in which ghosts have the values of their owners.
+    """Return `rows` after the rows of ghosts are replaced by the rows of their owners.
 
     `rows` (n, k): values at the n local dofs.
     """

@@ -22,8 +22,8 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
     """Return the compiled sums over the points of each cell for `OfSuction`, or None if the law needs no sums.
 
     `F`: deformation gradient (d, d), a UFL variable.
-    `slopes`: UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d), and with F-bar
-    also of the mean stress.  Empty for laws without suction.
+    `slopes`: UFL derivatives of stresses with respect to the pressure: first Piola-Kirchhoff stress (d, d), and with
+    F-bar the mean stress.  Empty for laws without suction.
     `locks`: whether the law uses F-bar.
     """
     share = 1 / ufl.det(points.F)

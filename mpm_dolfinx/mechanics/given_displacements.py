@@ -49,7 +49,7 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the component of a Q1 field along `direction`, as a mean over points with the given moments."""
+            """Return the component along `direction` of a Q1 field w, as a mean over an area with the given moments."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
@@ -172,7 +172,7 @@ class GivenDisplacements(Acting):
             step, given = given[0] - given[1], np.concatenate(given[1:], axis=1)
             if place.inertia and ends:
                 step = step + self._jump(place, points, hold, axes, p)
-            R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
+            R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # rotates the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             fields = {name: p.area0 * values[at] for name, values in moduli.items()}
             fields |= {"number": np.full(len(gap), number), "area": p.area0, "gap": gap, "step": step, "given": given}
@@ -228,7 +228,7 @@ class GivenDisplacements(Acting):
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
-            jump = self._jump(place, before, hold, axes, p)  # a prescribed value may begin away from the position
+            jump = self._jump(place, before, hold, axes, p)  # jump from the position to a prescribed value
             gaps = (p.origin(before) + start - p.now(before) - jump, p.origin(points) + end - p.now(points))
             old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start + jump))
             moves = increment > NEAR * self._grid.least
@@ -266,7 +266,7 @@ class HoldLoads(Loads):
 
     `data`: integration points, one for each component, with stiffness, direction and gap.
     `held`: geometry and stiffness of all penalties.
-    `row` (k,): index in `held` of each component.
+    `row` (k,): index, in `held`, of the penalty of each component.
     `share` (k, 2^d): fraction of the force of each component on each node, see `HeldCells.rows`.
     `place`: time and cut domains of the substep.
     """
@@ -297,7 +297,7 @@ class HoldLoads(Loads):
         self._lacked = np.full(1, np.inf)  # for each side of a connected part: sum of gaps in the last `augment`
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces of sides that lag behind to their multipliers.  Return whether any force changed.
+        """Add the penalty forces to the multipliers of sides that lag behind.  Return whether any force changed.
 
         The updates end when one update leaves more than half of the mean gap of every side.
         """
@@ -352,7 +352,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return dofs and penalty forces; forces at wall nodes are no wall reactions, see `Loads.counted`."""
+        """Return dofs and penalty forces.  Forces at wall nodes are not reactions of walls, see `Loads.counted`."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

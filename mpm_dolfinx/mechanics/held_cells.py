@@ -74,10 +74,10 @@ def inner_cells(
     cell: NDArray[np.int32],
     normal: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return for each of n points on sides the local cell (n,) whose constraint includes the point.
+    """Return the local cell (n,) of each point on a side: the cell whose penalty on the mean includes the point.
 
-    Points in nearly empty cells belong to the constraint of the next cell inside the body (aggregation; Badia, Verdugo
-    and Martin 2018).
+    Points in nearly empty cells belong to the penalty of the next cell inside the body (aggregation; Badia, Verdugo and
+    Martin 2018).
 
     `fill` (cells,): volume fractions.
     `sides`: for each condition, the prescribed components, and the extent (d,), in m, of the prescribed positions.
@@ -105,10 +105,10 @@ class HeldCells:
     Attributes
     ----------
     number, cell
-        Index of the condition, and cell, of each penalty.
+        Index of the condition of each penalty, and its local cell.
     x, shape, moments
-        For each penalty: position (m), values of shape functions, and products of offsets from the midpoint of the
-        cell.  For a penalty on a mean, these values are means over the side too.
+        Of each penalty, `x`: position (m), `shape`: shape functions, `moments`: products of offsets from the cell's
+        midpoint.  For a penalty on a mean, these values are means over the side too.
     stiffness
         Stiffness of each penalty and component, N/m.
     static
@@ -177,7 +177,7 @@ class HeldCells:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
         If the prescribed displacement does not tend to zero at a wall, the wall carries the force on its nodes.  A
-        penalty there is omitted if another penalty of the same condition acts on one of the same free nodes.
+        penalty at a wall is omitted if another penalty of the same condition acts on one of the same free nodes.
 
         `given` (conditions,): whether each condition prescribes component `axis`.
         `free` (nodes,): whether no wall fixes the node.

@@ -7,8 +7,8 @@ displacement since the start of the step is u.  The predictor u^ is the displace
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
 The velocity is v_n at the start of the step, and v at the end of the substep.  The previous substep has the velocity
-v_1 and the acceleration a_1.  The coefficients g and b of the time integration belong to this substep and to the
-previous substep (`time_integration`).  In an oscillation of angular frequency omega, each step of SDIRK2 dissipates the
+v_1 and the acceleration a_1.  In the time integration (`time_integration`), this substep has the coefficient g, and the
+previous substep has b.  In an oscillation of angular frequency omega, each step of SDIRK2 dissipates the
 fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy.
 
 The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
@@ -348,12 +348,12 @@ class Mass:
         return inverses(self._mean(off[:, None] * off + second))
 
     def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume-weighted mean (..., n) of values (..., m) of its pieces."""
+        """Return the volume-weighted mean (..., n) of values (..., m) over the pieces of each point."""
         pieces = self._cut.pieces
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return for each domain the affine velocity field nearest to the field of the nodal velocities v."""
+        """Return affine velocity fields: in each domain, the field nearest to the field of the nodal velocities v."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)

@@ -44,7 +44,7 @@ STRESS = "stress of the law"
 
 
 class SumsOfPart(NamedTuple):
-    """Kernels for sums over the integration points of one law in each cell, which give theta and pi."""
+    """Kernels that sum over the integration points of one law in each cell.  Theta and pi follow from the sums."""
 
     ratio: CellSums
     stress: PointExpression  # components of P for the residual, then the derivative of psi by theta for pi
@@ -215,7 +215,7 @@ class MeanDilatation:
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi to the tangent, without final assembly.
 
-        `sums`: for each law, integrals (cells, quantities) over each cell, the third result of `FBar.forms`.
+        `sums`: for each law, the third result of `FBar.forms`: integrals (cells, quantities) over each cell.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(

@@ -38,8 +38,8 @@ SHARE = 0.5
 """In cells of flowing, dilatant soil, the deviation of grad u from its cell mean is multiplied by this factor.
 
 Without this factor, dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees)
-does not reach a limit.  It is 4.4 % too large with 9 cells over the width of the footing, and 3.4 % with 17 cells.
-With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
+does not reach a limit.  This load is 4.4 % too large with 9 cells over the width of the footing, and 3.4 % with 17
+cells.  With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 """
 
 
@@ -139,7 +139,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws are evaluated.  The factor `SHARE` moves them towards cell means."""
+        """Return the positions at which laws are evaluated.  `SHARE` moves them towards their mean in the cell."""
         if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self.materials.dilating(cut.points))

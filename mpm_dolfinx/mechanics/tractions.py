@@ -110,7 +110,7 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange that sends values of patches to the owners of their cells, and the received positions."""
+    """Return the exchange that sends values at `patches` to the owners of their cells, and the received positions."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))

@@ -14,7 +14,7 @@ from mpm_dolfinx.mechanics.tractions import DeadLoads
 
 
 class Weight(Acting):
-    """Weight in a scene.
+    """Weight of the bodies and of their pore fluid in a scene.
 
     `pieces`: all integration points, with `density`, in kg/m^3, at the start of the step.
     `u`: displacement increment of the step.

@@ -56,7 +56,7 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Arrays by local cell, and by unrolled local degree of freedom.  `clear` sets these arrays to 0.
+        Arrays with one entry for each local cell, or unrolled local degree of freedom.  `clear` sets these arrays to 0.
 
     Attributes
     ----------

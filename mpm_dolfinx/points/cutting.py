@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, c
 SLIVER = NEAR**2
 """Smallest volume of a piece, divided by the volume of its domain.  Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
-TANGLED = 0.2  # smallest volume within the corners / volume of the point; below it corners are re-initialised from F
+TANGLED = 0.2  # smallest volume inside the corners / volume of the point, without re-initialisation from F
 
 
 @dataclass
@@ -170,7 +170,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
     """Cut the particle domains by the grid.
 
     `corners` (n, 2^d, d), in m: corners of the domains, inside the grid, in the order of `corner_bits`.
-    `second`, `faces`: whether to compute second moments and face areas of the pieces.
+    `second`: whether to compute second moments of the pieces.  `faces`: whether to compute their areas on cell faces.
 
     Returns
     -------
@@ -271,7 +271,7 @@ class _Slots:
         self.cell = self.low[:, self.point] + self._place
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the slots of pairs of a domain, `owner`, and a cell, `index`."""
+        """Return the slots of the domains `owner` (n,) and their cells with the grid indices `index` (d, n)."""
         before = self._start - (self.low * self._stride).sum(axis=0)
         out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
         for place, stride in zip(index[:-1], self._stride, strict=False):
@@ -279,7 +279,7 @@ class _Slots:
         return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return for each slot the sum of values over the slots of the same domain beyond it along an axis."""
+        """Return sums of values: for each slot, over all slots of its domain with larger grid indices along an axis."""
         out = np.zeros(self.size)
         for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -435,11 +435,11 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over pieces of products of two coordinates, measured from the lower corner of the cell."""
+    """Return integrals of products x_a x_b over each piece, with x relative to the lower corner of its cell."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return the integrals over the slices of a product of up to three coordinates."""
+        """Return integrals over each slice: of the product of the given coordinates (at most three), or of 1."""
         if not factors:
             return area
         if len(factors) == 1:
@@ -591,7 +591,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane.  Return parts below the plane, their owners, parts above, and their owners."""
+    """Cut each simplex at its plane.  Return parts below it and their entries of `owner`, then the same above it."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane

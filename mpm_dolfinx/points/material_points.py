@@ -174,7 +174,7 @@ class MaterialPoints:
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:
-        """Deformation gradient (n, 3, 3) for laws, or (n, 2, 2) in plane strain without an out-of-plane stretch."""
+        """Deformation gradient for laws: (n, 2, 2) in plane strain without `ACROSS` in `data`, otherwise (n, 3, 3)."""
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
     def strained(self, F: NDArray[np.float64], **others: NDArray[np.float64]) -> MaterialPoints:
@@ -205,7 +205,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points in the entries `rows` (n,), and the points `other` in all other entries."""
+        """Return both sets of points: these points in the entries `rows` (n,), and `other` in all other entries."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -240,7 +240,7 @@ class MaterialPoints:
         return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return for all `ids` that are on this process their indices in `ids`, and the indices of their points."""
+        """Return indices (k,) in `ids` of the k ids on this process, and the indices (k,) of their points."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)

@@ -87,7 +87,7 @@ def relative(
 ) -> NDArray[np.float64]:
     """Return the norms divided by the scales.
 
-    The result is 0 for norms of at most `round_off`, and otherwise inf for scales of 0 and infinite norms.
+    Norms of at most `round_off` give 0.  All larger norms with a scale of 0, and infinite norms, give inf.
     """
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
@@ -154,7 +154,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     at, box = tuple((index - low).T), np.zeros(index.max(axis=0) - low + 1, dtype=bool)
     box[at] = True
     around = np.zeros((3,) * index.shape[1], dtype=bool)
-    around[..., 1] = True  # copies have no nodes in common
+    around[..., 1] = True  # copies of the grid have no nodes in common
     number, count = label(box, around)
     return number[at].astype(np.int64) - 1, count
 

@@ -97,7 +97,7 @@ class Polygons:
         kept = used & (np.abs(self.after - self.x).max(axis=2) > near)
         number = np.cumsum(kept, axis=1) - kept  # vertices after the last kept vertex merge with the first one
         number = number % np.maximum(kept.sum(axis=1), 1)[:, None] + most * np.arange(n)[:, None]
-        means = means_of_rows(number[used], np.ones(used.sum()), self.x[used], n * most)  # alike in mirror images
+        means = means_of_rows(number[used], np.ones(used.sum()), self.x[used], n * most)  # equal for mirror images
         out = _packed(means[number], self.edge, kept)
         k, last = np.arange(out.edge.shape[1]), np.maximum(out.count - 1, 0)[:, None]
         before = np.roll(out.x, 1, axis=1)  # vertices are padded by the last one
@@ -139,7 +139,7 @@ class Polygons:
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
-        for first in range(3 if n == 6 else n):  # opposite starts divide hexagons alike
+        for first in range(3 if n == 6 else n):  # opposite first vertices divide hexagons alike
             rolled = np.roll(self.x, -first, axis=1)
             area = Polygons.rings(rolled[:, :size]).area
             least = np.minimum(area, whole - area)

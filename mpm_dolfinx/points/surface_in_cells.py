@@ -69,7 +69,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area fraction of each of `count` cells.  All cells outside `cells` have 1."""
+        """Return the filled area fraction of each of `count` cells.  All cells that are not in `cells` have 1."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -110,7 +110,7 @@ def resampled(
     between surface and chord, or in axisymmetry the volume of the ring of this area.
 
     `of` (m,): index of the cell of each segment, ascending.
-    `x` (m, 2, 2): both ends of each segment, from 0 to 1 in its cell.
+    `x` (m, 2, 2): both ends of each segment, in coordinates from 0 to 1 of its cell.
     `around` (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)

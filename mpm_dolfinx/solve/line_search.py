@@ -5,9 +5,9 @@ Without yield, a Newton step is halved in two cases: a law cannot be evaluated a
 than the factor `EXPLODES`.
 
 In yielding soil, the criterion is the work of the residuals along the step.  A full step is accepted in two cases: if
-the work at its end is less than half of the initial work, or if neither residual nor work increase.  Otherwise
-bracketed secants find the step length at which the work is zero.  The secants end when the work is less than half of
-the initial work (Matthies and Strang 1979).  A step with negative initial work is reversed.
+the work at its end is less than half of the initial work, or if neither residual nor work increase.  In all other
+cases, bracketed secants find the step length at which the work is zero.  The secants end when the work is less than
+half of the initial work (Matthies and Strang 1979).  A step with negative initial work is reversed.
 
 In yielding soil, full steps overshoot.  The tangent is therefore regularised by a fraction of the elastic shear
 stiffness, proportional to the relative residual of the forces (Levenberg 1944, Marquardt 1963).

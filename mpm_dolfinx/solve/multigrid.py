@@ -124,7 +124,7 @@ def interpolation(
     nodal: bool,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the interpolation matrix, and for the coarse grid the local unknowns and fixed degrees of freedom.
+    """Return the interpolation matrix, and the local unknowns and fixed degrees of freedom of the coarse grid.
 
     A coarse cell is an unknown if it contains an unknown fine cell. A coarse node is an unknown if it coincides with a
     free fine node, or interpolates to free fine nodes only.
@@ -156,7 +156,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return for each entry of an interpolation matrix: fine unknown, coarse unknown (grid indices), and weight."""
+    """Return the fine unknown, coarse unknown (grid indices) and weight of each entry of an interpolation matrix."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5

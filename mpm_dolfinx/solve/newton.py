@@ -89,8 +89,8 @@ class Errors:
 
     u: NDArray[np.float64]  # relative residual of momentum
     p: NDArray[np.float64]  # relative residual of storage
-    forces: NDArray[np.float64]  # scale of u, N
-    exchanged: NDArray[np.float64]  # scale of p: exchanged fluid volume, m^d
+    forces: NDArray[np.float64]  # forces that scale the residual of momentum, N
+    exchanged: NDArray[np.float64]  # exchanged fluid volume that scales the residual of storage, m^d
     start: NDArray[np.float64]  # forces at the start of the step, N
     fluid: StorageResidual | None  # residual of the storage, or None
 
@@ -120,7 +120,7 @@ def solve_substep(
     `solvers`: linear solvers for the unknowns of the active cells.
     `momentum`, `storage`: the balances. `storage` is None without fluid.
     `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    `as_reset`, `key`: context with the state at the last grid reset, and cache key of its tangent for linear laws.
+    `as_reset`: context with the state at the last grid reset.  `key`: cache key of its tangent for linear laws.
     `report`: report of the step, to which the counts of the substep are added.
     `kept`: factors that the tangents of the step share.
 
@@ -132,7 +132,7 @@ def solve_substep(
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
     reusable = report.newton > 0 and momentum.smooth
-    follows = not report.history or max(report.history[0]) ** 2 <= solvers.plan.keep  # first residual small
+    follows = not report.history or max(report.history[0]) ** 2 <= solvers.plan.keep  # after a small first residual
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual shows a failed solve
         errors = newton.alternate() if in_turn else newton.newton(as_reset, key, reusable, ahead if follows else None)
         took = newton.report
@@ -298,7 +298,7 @@ class Newton:
                 found = self._errors(errors.start)
             except NotConverged:
                 continue
-            better = found.u < least  # p is equal; its residual has no meaning before fluid is exchanged
+            better = found.u < least  # all guesses have the same p
             if better.any():
                 at = guess if better.all() else np.where(better[self._parts], guess, at)
                 least, last = np.minimum(found.u, least), at if better.all() else None

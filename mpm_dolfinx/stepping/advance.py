@@ -95,7 +95,7 @@ class Motion:
         """Return the state at time t (s) after a solved step, and the number of inverted domains.
 
         `state`: state at the start of the step.
-        `on_grid`, `data`: the bodies on the grid, and their integration points at the start of the step.
+        `on_grid`: the bodies on the grid. `data`: their integration points at the start of the step.
         `loads`: loads at the end of the step.
         `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. With None, volume defects
         do not change.
@@ -168,7 +168,7 @@ class Motion:
         return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), folded
 
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
-        """Return the trend of the points after a step."""
+        """Return the rates of the points in the last steps (at most three), including this step."""
         (n, d), before = points.x.shape, state.trend
         change, gradient_change = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
         pressure = (points.pressure - state.points.pressure)[:, None] if self._storage is not None else change[:, :0]
@@ -320,7 +320,7 @@ class Motion:
         return points.strained(F, corners=corners, x=centroids(corners)), keeps, folded
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask of corner components that are neither prescribed nor fixed by walls."""
+        """Return a mask of displacement components of corners that are neither prescribed nor fixed by walls."""
         fixed = fixed_corners(self._momentum.grid, stage.conditions["walls"], points.corners)
         return ~(given(stage.lattices, points) | fixed)
 
@@ -343,7 +343,7 @@ class Motion:
         for one in loads:
             corners = one.outside(corners, own)
         if flat := over_all(grid.comm, int((volumes(corners) == 0).sum())):  # flat domains cannot be cut into pieces
-            raise NotConverged(f"the step flattens domains, {flat} in all")
+            raise NotConverged(f"the step flattens {flat} domains")
         return replace(points, corners=corners, x=centroids(corners))
 
     def _volume_defect(

@@ -58,7 +58,7 @@ class Start(NamedTuple):
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
-        """Return the function `carried` of `Motion.advanced`, or None without inertia."""
+        """Return the argument `carried` of `Motion.advanced`, or None without inertia."""
         if flight is None:
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
@@ -115,14 +115,14 @@ class Balances(NamedTuple):
 
 
 def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  The matrix pattern of each contact covers all substeps."""
+    """Return the loads of each substep.  The sparsity pattern of each contact covers all substeps."""
     if not any(map(attrgetter("couples"), chain.from_iterable(loads))):
         return loads
     return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  Reactions of supports include the nodal displacement `State.rest`."""
+    """Return the loads of each substep, after an additional nodal displacement `State.rest` (see `Loads.moved`)."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -190,7 +190,7 @@ def balances(
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
-        u = inertia.flight  # other starts cause large inertia forces that hide the imbalance
+        u = inertia.flight  # all other initial guesses cause large inertia forces that hide the imbalance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)

@@ -18,7 +18,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Distributed(Protocol):
-    """Interface of a simulation with a scene and a state."""
+    """Simulation whose scene and state `distribute` may replace."""
 
     scene: Scene
     state: State

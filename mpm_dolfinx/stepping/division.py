@@ -26,7 +26,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Division:
-    """Division and merging of the particle domains in a scene with given faces and materials."""
+    """Division and merging of the particle domains in a scene."""
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
         self._grid = materials.grid
@@ -65,7 +65,7 @@ class Division:
 
     @cached_property
     def _outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ids of seeded domains, and indices of their faces, on the surfaces of all bodies."""
+        """Ids of seeded domains with faces on the surfaces of bodies, and the indices of these faces."""
         found = [body.outer() for body in self._domains.bodies]
         ids = [start + row for start, (row, _) in zip(self._domains.starts, found, strict=False)]
         return np.concatenate(ids), np.concatenate([face for _, face in found])
@@ -125,9 +125,9 @@ class Division:
         return wants
 
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return a row of numbers for each domain, and whether the domain is the upper one of two halves.
+        """Return numbers (n, k) that identify pairs of halves, and whether each domain is the upper half of its pair.
 
-        The two halves of a divided domain have equal rows. Rows of other domains contain nan.
+        The two halves of a divided domain have identical rows. The rows of all other domains contain nan.
         """
         root, part = roots(points)
         place, size = self._domains.places(root), np.ptp(part, axis=2)
@@ -175,10 +175,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each domain and axis whether the length is at least twice the seeded length."""
+    """Return whether each domain is at least twice as long as at seeding, for each axis."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each domain and axis whether the length is at most half the seeded length."""
+    """Return whether each domain is at most half as long as at seeding, for each axis."""
     return 2 * now <= seeded * (1 + SAME)

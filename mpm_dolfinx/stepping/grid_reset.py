@@ -126,7 +126,7 @@ class OnGrid(Keyed):
     def resisting_mass(self, seconds: float) -> NDArray[np.float64]:
         """Return the ratio of inertial to elastic resistance (n,) in the filled owned cells.
 
-        In 2 x 2 cells of Q1 elements with a consistent mass, a displacement of the middle node over the time t has a
+        Let 2 x 2 cells of Q1 elements have a consistent mass. A displacement of the middle node over the time t has a
         resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.  `seconds`: t, in s.
         """
         filled, cut = self.contents.filled, self.cut
@@ -238,7 +238,7 @@ class OnGrid(Keyed):
                 values[rows] = before
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
-        """Return the pressure in the cell of each piece (m,) at the start of a step, in Pa."""
+        """Return the pressure (m,), in Pa, of each piece's cell at the start of a step."""
         return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
@@ -272,7 +272,7 @@ class OnGrid(Keyed):
         The mean mass potential of the pieces equals the potential of their cell. In unsaturated scenes, the pore water
         of a cell is conserved instead.
 
-        `store` (m,), m^d/Pa: storage of the pieces, the weights of the means.
+        `store` (m,), m^d/Pa: storage of the pieces, which is their weight in means.
         `t`, s: time of the pressures on open sides.
         `water`: pore water of the pieces, in unsaturated scenes.
         `at_rest`: hydrostatic pressures, subtracted before the reconstruction, or None without gravity.
@@ -566,7 +566,7 @@ class Assembled(Keyed):
         for one in loads:
             of_cells = one.rounding(of_cells)
         own = cells[cells < grid.num_owned]
-        at_nodes = momentum.at_nodes(own, [of_cells[own, None]])[0] / 2 ** (grid.dim - 1)  # cells at a flat side
+        at_nodes = momentum.at_nodes(own, [of_cells[own, None]])[0] / 2 ** (grid.dim - 1)  # as in cells at a flat side
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
@@ -579,7 +579,7 @@ class Assembled(Keyed):
         loads: Sequence[Loads],
         present: At,
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u.
+        """Return the conditions on the fluid, and a function `outflow(begins)` that returns the fluxes at u.
 
         If `begins` is True, invalid values raise ValueError.
 
@@ -588,7 +588,7 @@ class Assembled(Keyed):
         `data`: integration points.
         `t`, s: time of the pressures and fluxes on open sides.
         `dt`, s: length of the step.
-        `loads`, `present`: loads in the balance of momentum, and present displacements.
+        `loads`: loads in the balance of momentum. `present`: present displacements.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents

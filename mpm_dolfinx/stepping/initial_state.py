@@ -108,11 +108,11 @@ def begin_stage(
     """Return the state at the beginning of a stage with the new conditions `named`, see `Simulation.stage`."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
-        raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
+        raise ValueError("gravity: the scene has none; to change it, create the scene with gravity=(0, 0)")
     if "inertia" in named:
         flag("stage: inertia", named["inertia"])
         if scene.momentum.inertia is None:
-            raise ValueError("stage: inertia: the scene has none; for changes it must be created with inertia=False")
+            raise ValueError("stage: inertia: the scene has none; to change it, create the scene with inertia=False")
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are still to be added")
     flag("stage: reset_displacement", reset_displacement)
@@ -189,7 +189,7 @@ def _released(
     cut = start.on_grid.cut
 
     def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return a mask of displacement components along `axes`, at nodes of cells with these surfaces."""
+        """Return a mask of displacement components along `axes`, at nodes of cells that contain the surfaces `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
@@ -269,7 +269,7 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
 
 
 def _warn_dammed(scene: Scene, stage: Stage, t: float) -> None:
-    """Warn of gravity with a component along the normal of tied sides, which drives pore fluid."""
+    """Warn of a gravity component along the normal of tied sides. This component drives pore fluid."""
     tied = stage.of(Tied)
     gravity = stage.gravity_at(t) if tied and scene.fluid and scene.materials.conducts else None
     for name, one in tied.items() if gravity is not None else ():
@@ -341,7 +341,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks such data."""
+    """Return the points without data that points of added bodies lack. Raise ValueError if `fields` lacks such data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -414,7 +414,7 @@ def balanced(scene: Scene, state: State) -> State:
     try:
         start = set_up(scene, state, 0.0)
         seeded = _as_reset(scene, start)
-        if scene.storage is not None:  # as after a step
+        if scene.storage is not None:  # points have pressures, as after a step
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
         unknowns = start.matrices.momentum.unknowns
@@ -465,7 +465,7 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
     if left > REMARKABLE and not touches:
         scene.forget()
         what = "initial_stress: must be in equilibrium with loads and supports at the start"
-        raise ValueError(f"{what}: {100 * left:.2g} % of the forces remain")
+        raise ValueError(f"{what}: {100 * left:.2g} % of the forces remain out of balance")
     before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
     what = "initial_stress: balanced after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces remain"

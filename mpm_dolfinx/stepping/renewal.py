@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-F of yielded soil is updated by increments, so the domains of this soil serve for integration only. Cells with a piece
-of a domain longer than `LONGEST` are filled anew:
+F of yielded soil is updated by increments, so the domains of this soil serve for integration only. A cell is filled
+anew if it contains a piece of a domain that is longer than `LONGEST`:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
@@ -43,7 +43,7 @@ LONGEST = 1.0
 
 
 class Renewal:
-    """Renewal of the particle domains in a scene with given faces and materials."""
+    """Renewal of the particle domains in a scene."""
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
         self._grid = materials.grid
@@ -87,7 +87,7 @@ class Renewal:
         try:
             if comm.rank == 0:
                 made, count = self._renewed(state)
-        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised on all below
+        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised below, by all
             message = str(error)
         if message := first(comm, message):
             raise NotConverged(f"renewal of domains: {message}")

@@ -149,7 +149,7 @@ class Result:
         `elastic`: elastic energy, or 0 for laws without a known elastic energy.
         `external`: work of all loads.
         `internal`: work of the stresses.
-        `dissipated`: `internal` minus `elastic`. In wet bodies, it includes the work of flow and storage of water.
+        `dissipated`: `internal` minus `elastic`. In wet bodies, this includes the work of flow and storage of water.
         `viscous`: work of quiet sides and user-defined terms.
         `friction`: work of slip at tools and contacts.
         `renewal`: kinetic and elastic energy that renewed domains have lost.

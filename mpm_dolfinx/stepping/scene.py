@@ -193,7 +193,7 @@ class Scene:
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Warn once if conductivities refer to another gravity than that of a step."""
+        """Warn once if conductivities refer to a gravity other than the gravity of a step."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
@@ -228,7 +228,7 @@ class Scene:
         return out
 
     def adopted(self, state: State) -> State:
-        """Return a state of the same scene on another partition, converted to the partition of this scene."""
+        """Convert a state of this scene on another partition to the present partition, and return it."""
         before = state.stage
         given = {**before.conditions, "conditions": tuple(before.given.values())}
         nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
@@ -278,7 +278,7 @@ class Scene:
 
     @cached_property
     def _replacing(self) -> Sequence[Callable[[State], tuple[State, int]]]:
-        """Functions for division and merging, or for renewal, of particle domains at a reset of the grid."""
+        """Functions that replace particle domains at a reset of the grid, by division and merging, or by renewal."""
         grid = self.grid
         if not self.numerics.renewal:
             return ()

@@ -174,7 +174,7 @@ class Stage:
         return [one for acting in self.acting for one in acting.held]
 
     def supported(self, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return along which axes (d,) walls or conditions support the bodies.
+        """Return a mask (d,) of the axes along which walls or conditions support the bodies.
 
         `corners` (n, 2^d, d): corners of the domains.
         """
@@ -210,7 +210,7 @@ class Stage:
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces with conditions on displacements since seeding.  Their domains must not be replaced."""
+        """Faces of conditions that depend on displacements since seeding. Their domains must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property
@@ -328,7 +328,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError for conditions that need inertia in a stage without it, or that inertia does not allow."""
+    """Raise ValueError if conditions need inertia and the stage has none, or if they do not allow its inertia."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")

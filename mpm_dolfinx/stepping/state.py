@@ -45,7 +45,7 @@ class StepControl:
     change : (bodies,), Pa
         Largest pressure change of each body since the start of the run.
     first : (bodies,), Pa/s
-        Pressure change in the first substep of the last step, divided by the length of this step.
+        Pressure change in the first substep of the last step, divided by the length of the last step.
     start : (2, bodies), Pa
         Smallest and largest cell pressure of each body at the start of the run; None before the first step.
     motion : J^(1/2)
@@ -105,7 +105,7 @@ class Trend:
         """Return the changes (n, ...) in a time `seconds` (s), by polynomial extrapolation.
 
         `implicit`: whether the rate at the end of this time replaces the mean rate.
-        `first`, s: length of a first substep, or 0. The change in this substep, times `seconds / first`, is subtracted.
+        `first`, s: length of a first substep, or 0. If > 0, `seconds` times the rate at its end is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -152,10 +152,10 @@ class State:
     begins
         Whether the next step is the first step of the stage.
     velocity : (unknowns,), m/s
-        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or contact, they give the
-        initial guess of Newton's method. None before the first step, and in other scenes.
+        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or quasi-static contact,
+        they give the initial guess of Newton's method. None before the first step, and in all other scenes.
     trend
-        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in other
+        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in all other
         scenes, and after bodies were added.
     held : (unknowns,), N
         Additional nodal forces on this process, with ghosts, for equilibrium at the start of a stage. None without such
@@ -188,7 +188,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
+            raise ValueError("state: points have true positions, must be relative to the grid's base: see from_base")
         _freeze(vars(self))
 
     @property
