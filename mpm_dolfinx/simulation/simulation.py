@@ -58,9 +58,9 @@ class Simulation:
         Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the displacement
         components that they fix, such as {"left": "xy", "bottom": "y"}.
     conditions
-        Conditions on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
-        `Inflow` on their sides, rigid `Tool`s, and `Contact`s between groups of bodies. Sides without a condition are
-        free of traction and undrained.
+        Conditions on the bodies, in any order: on their sides `Traction`, `Pressure`, `Displacement`, `RigidPlate`,
+        `Quiet`, `Tied`, `Drained`, `Inflow`, `Rain` and the two conditions of `water`; rigid `Tool`s; and `Contact`s
+        between groups of bodies. Sides without a condition are free of traction and undrained.
     fluid
         Pore fluid; None for a dry scene.
     gravity : (d,) or callable t -> (d,), m/s^2
