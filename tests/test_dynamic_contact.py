@@ -318,6 +318,24 @@ def sledge(mirror=1, **options):
     return mpm.Simulation(grid, [body], [STIFF], conditions=[tool], **options)
 
 
+def test_impulses_of_tools_and_walls_are_the_changes_of_momentum():
+    """A disc strikes a block. The force at the end of a step, times its length, is no impulse."""
+    grid = mpm.Grid([0, 0], [2, 2], [8, 8])
+    disc = mpm.Tool(mpm.Ball((1.0, 1.35), 0.3), mass=600, velocity=(0, -2), name="disc")
+    walls, block = {"left": "x", "right": "x", "bottom": "xy"}, mpm.box(grid, [0, 0], [2, 1])
+    s = mpm.Simulation(grid, [block], [STIFF], walls=walls, conditions=[disc], inertia=True)
+    result = s.run(0.04, 4e-3, progress=False)
+    impulse, forces = s.outcome("impulse")["disc"], result.tool_forces["disc"][1:]
+    lost = -600 * (s.outcome("tool_velocity")["disc"] - [0, -2])
+    assert impulse[:2] == pytest.approx(lost, abs=1e-7 * np.abs(lost).max())
+    assert abs(4e-3 * forces[:, 1].sum() / impulse[1] - 1) > 0.01
+    held = sum(s.outcome("wall_impulse").values())
+    momentum = mass(s) @ s.points.data["velocity"]
+    assert impulse[:2] + held == pytest.approx(momentum, abs=1e-4 * np.abs(lost).max())
+    s.stage(inertia=False, conditions=[])
+    assert s.outcome("impulse") == {}
+
+
 def test_friction_brakes_a_free_tool_on_either_side_alike():
     s, other = sledge(), sledge(-1)
     for one in (s, other):

@@ -83,6 +83,9 @@ def test_light_rain_soaks_in_and_its_water_is_all_there():
     s.run(3600, 600, progress=False)
     assert s.outcome("runoff").array == [0.0]
     assert s.outflows["rain"] == pytest.approx(-0.3 * K / 20, rel=1e-12)
+    assert s.outcome("rained")["rain"] == pytest.approx(0.3 * K * 3600 / 20, rel=1e-12)
+    names = ("rain", "runoff", "rained", "flowed", "ran_off", "ponded")
+    assert {type(s.outcome(name)["rain"]) for name in names} == {np.float64}
     assert 20 * (water(s) - start) == pytest.approx(0.3 * K * 3600, rel=1e-4)
 
 

@@ -413,3 +413,18 @@ def test_mapped_bodies_are_not_integrated_at_points():
             walls={"bottom": "xy"},
             numerics=mpm.Numerics(quadrature="point"),
         )
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "said"),
+    [
+        (lambda: mpm.Hencky(E=1e7, nu=0.3), TypeError, r"bulk = E / \(3 - 6 nu\) and shear = E / \(2 \+ 2 nu\)"),
+        (lambda: wet(lambda conductivity, J: conductivity * np.exp(J)), ValueError, "ufl.exp and the like in place of"),
+        (lambda: scene(BODY), ValueError, "^bodies = a single LatticeBody, must be a list"),
+        (lambda: scene().points.position, AttributeError, "'position', must be one of id, .* x, .* J, displacement"),
+    ],
+    ids=["Young's modulus", "numpy in a law", "a body without a list", "an unknown field of points"],
+)
+def test_messages_tell_the_right_spelling(make, error, said):
+    with pytest.raises(error, match=said):
+        make()

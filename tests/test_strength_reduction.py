@@ -55,6 +55,7 @@ def test_a_block_carries_what_its_strength_over_the_factor_does(materials):
     s = block(materials)
     state = s.state
     safety = mpm.factor_of_safety(s, rtol=0.005)
+    assert str(safety).startswith(f"factor of safety {safety.factor:.3f}, between 1.")
     assert safety.factor == pytest.approx(EXACT, rel=0.005)
     assert safety.bounds[1] < 1.006 * safety.bounds[0]
     assert s.state is state, "the simulation is what it was"

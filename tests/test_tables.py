@@ -82,6 +82,8 @@ def test_a_plot_has_the_domains_and_the_values_of_the_points(field, label):
     assert np.array_equal(drawn.get_array(), wanted[field])
     low, high = s.points.corners.min(axis=(0, 1)), s.points.corners.max(axis=(0, 1))
     assert ax.get_xlim()[0] <= low[0] and ax.get_ylim()[1] >= high[1] and ax.get_xlabel() == "x (m)"
+    ax.figure.canvas.draw()
+    assert ax.child_axes[0].get_tightbbox().x1 < ax.figure.bbox.x1, "numbers of the bar are cut off"
     assert mpm.plot(s, field, ax=ax, bar=False) is ax and len(ax.child_axes) == 1
     matplotlib.pyplot.close("all")
 

@@ -162,6 +162,28 @@ def test_backward_euler_is_an_option_and_of_first_order():
     assert 0.8 < rates(errors).min() < 1.3
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_volumes_that_flow_out_are_the_loss_of_water(method, tmp_path):
+    """A jump of the load: the outflow at the end of a step, times its length, is no volume."""
+
+    def scene():
+        numerics = mpm.Numerics(method=method)
+        given = [OPEN, mpm.Inflow("bottom", 1e-3, name="well"), mpm.Traction("top", (0, -1e4))]
+        return column(conditions=given, numerics=numerics, fluid=SOFT_WATER)
+
+    s, start = scene(), scene().cells().water.sum()
+    file = tmp_path / "state.npz"
+    result = s.run(20, 5, checkpoint=mpm.Checkpoint(file), progress=False)
+    flowed = s.outcome("flowed")
+    assert flowed["well"] == pytest.approx(-1e-3 * 0.1 * 20, rel=1e-12)
+    assert sum(flowed.values()) == pytest.approx(start - s.cells().water.sum(), rel=1e-9)
+    assert result.outcome("flowed")["drained_top"][[0, -1]].tolist() == [0.0, flowed["drained_top"]]
+    later = scene()
+    later.run(30, 5, after=mpm.resume(later, file), progress=False)
+    s.run(30, 5, after=s.result, progress=False)
+    assert later.outcome("flowed") == s.outcome("flowed") != flowed
+
+
 def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
     """Kelvin-Voigt: strain = q / M (1 - exp(-M t / eta)), under a constant load."""
     eta, load = 1e8, 1e3

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Rigid tools: exact pressures, stick and slip, energy, refusals, restart."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -55,6 +56,22 @@ def test_a_plate_presses_a_cube_evenly_wherever_it_lies(angle, offset, error):
         np.array([[0, -1], [0, 1]]) * 0.8 * exact, abs=-error * exact
     )
     assert worst < 1e-3
+
+
+@pytest.mark.parametrize("sharp", [True, False])
+def test_a_warning_names_a_tip_that_penetrates_between_contact_positions(sharp):
+    """A wedge comes down on the middle of a face of a domain, or a plate on the whole body."""
+    grid = mpm.Grid([0, 0], [2, 2], [8, 8])
+    shape = mpm.Cone((1.0625, 1.01), (0, 1), 20) if sharp else mpm.Convex([[0.4, 1.01], [1.7, 1.01], [1, 1.5]])
+    tool = mpm.Tool(shape, displacement=lambda t: (0, -t))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, conditions=[tool])
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always", mpm.ResolutionWarning)
+        s.run(0.03, 0.01, progress=False)
+    own = [str(one.message) for one in found if issubclass(one.category, mpm.ResolutionWarning)]
+    assert (s.tool_forces.array[0, 1] == 0) == sharp
+    assert any("deeper in a body than all contact positions" in text for text in own) == sharp
 
 
 def test_corners_of_a_gel_that_rough_plates_squeeze_stay_outside():

@@ -310,13 +310,13 @@ def test_what_is_no_law_of_retention_is_refused(law, said):
 
 
 def test_saturated_scenes_have_nothing_of_retention():
-    """No piece field, no form, no table, and volumes only where rain falls."""
+    """No piece field, no form, no table, and rain only where rain falls."""
     s = column(2, [mpm.Hencky(1e6, 1e6, conductivity=1e-6)], 0.0, [mpm.Drained("top")])
     s.run(1, 1, progress=False)
     forms = s.scene.storage
     assert not {"retention", "lever", "pores"} & s.scene.pieces.pieces.sizes.keys()
     assert (forms.retains, forms.fluxes.relative) == (False, None)
-    assert not {"runoff", "flowed", "ran_off", "ponded"} & s.state.outcome.keys()
+    assert not {"rain", "runoff", "rained", "ran_off", "ponded"} & s.state.outcome.keys()
 
 
 def test_a_specific_yield_does_not_go_with_it():

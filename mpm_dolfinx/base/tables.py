@@ -68,10 +68,11 @@ def _axes(dim: int, size: int) -> list[str]:
 def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
     """Return the unit of a quantity, or of its moments if `moment` is True; in plane strain per metre of depth."""
     units = {"tool_travel": "m", "tool_velocity": "m/s", "tool_rotation": "rad", "tool_spin": "rad/s"}
-    units |= {"outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
-    units |= dict.fromkeys(("flowed", "ran_off", "ponded"), "m^3")
+    units |= {"energy": "J"} | dict.fromkeys(("outflows", "rain", "runoff"), "m^3/s")
+    units |= dict.fromkeys(("flowed", "rained", "ran_off", "ponded"), "m^3")
+    units |= dict.fromkeys(("impulse", "wall_impulse"), "N m s" if moment else "N s")
     whole = units.get(quantity, "N m" if moment else "N")
-    of_slice = {"N": "N/m", "N m": "N", "m^3/s": "m^2/s", "m^3": "m^2", "J": "J/m"}
+    of_slice = {"N": "N/m", "N m": "N", "N s": "N s/m", "N m s": "N s", "m^3/s": "m^2/s", "m^3": "m^2", "J": "J/m"}
     return f"{of_slice[whole]}, in axisymmetry {whole}" if dim == 2 and whole in of_slice else whole
 
 

@@ -118,10 +118,11 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
 
 def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> None:
     """Raise a ValueError if values are not a list of instances of a class, or if there are fewer than `least`."""
-    kinds = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-    allowed = f"a list of {'at least one ' if least else ''}{kinds}"
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    allowed = f"a list of {'at least one ' if least else ''}{' or '.join(k.__name__ for k in kinds)}"
     if isinstance(values, str) or not isinstance(values, Sequence) or len(values) < least:
-        raise ValueError(f"{name} = {line(values)}, must be {allowed}")
+        what = f"a single {type(values).__name__}" if isinstance(values, kinds) else line(values)
+        raise ValueError(f"{name} = {what}, must be {allowed}")
     for value in values:
         if not isinstance(value, kind):
             raise ValueError(f"{name}: {line(value)}, must be {allowed}")
@@ -141,6 +142,8 @@ def asked(name: str, allowed: str, function: Callable, *values):
     try:
         return function(*values)
     except Exception as error:
+        if allowed.startswith("UFL") and "ufunc" in str(error):
+            allowed = f"{allowed}, with ufl.exp and the like in place of numpy.exp"
         raise ValueError(f"{name}: raises {type(error).__name__}: {line_of(error)}, must be {allowed}") from error
 
 

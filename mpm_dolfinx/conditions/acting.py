@@ -37,8 +37,12 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """Reactions, outflows and other results, by quantity (such as "reactions") and then by condition."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Names of the results of conditions."""
-OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
+OF_RAIN = ("rain", "runoff", "ran_off", "ponded")
 """Names of the results that only scenes with rain have."""
+VOLUMES = {"outflows": "flowed", "rain": "rained"}
+"""Names of the volumes since the start of the conditions, by the names of their rates."""
+IMPULSES = {"reactions": "impulse", "tool_forces": "impulse", "wall_reactions": "wall_impulse"}
+"""Names of the impulses since the start of the conditions, by the names of the forces.  Bodies have inertia."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 """Names of the results that only free tools have."""
 

@@ -317,8 +317,9 @@ class Rain(Flux):
     is possible.
 
     `Simulation.outflows` contains the flow through the side, and `outcome("runoff")` the run-off, in m^3/s (m^2/s in
-    plane strain).  `outcome("flowed")` is the total outflow since the start of the condition, in m^3 (m^2 in plane
-    strain).  `outcome("ran_off")` is the total of run-off and seepage, and `outcome("ponded")` the volume of the pond.
+    plane strain).  These outcomes are volumes since the start of the condition, in m^3 (m^2 in plane strain): "flowed"
+    (outflow), "rained" (rain), "ran_off" (run-off and seepage), and "ponded" (the pond).  "rained" plus "flowed" equals
+    "ran_off" plus "ponded".
 
     Parameters
     ----------

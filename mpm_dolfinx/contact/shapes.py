@@ -74,9 +74,14 @@ class Placed:
         return np.asarray(getattr(self, fields(self)[0].name)).shape[-1]
 
     @property
+    def places(self) -> NDArray[np.float64]:
+        """Positions (n, d), in m, in the first attribute, such as corners or a tip."""
+        return np.atleast_2d(getattr(self, fields(self)[0].name))
+
+    @property
     def middle(self) -> NDArray[np.float64]:
         """Mean (d,), in m, of the positions in the first attribute."""
-        return np.atleast_2d(getattr(self, fields(self)[0].name)).mean(axis=0)
+        return self.places.mean(axis=0)
 
     def moved(self, by: NDArray[np.float64]) -> Shape:
         """Return the shape, translated by a vector (d,), in m."""
@@ -225,7 +230,8 @@ class Cone(Placed):
     axis : (d,)
         Direction from the tip into the tool, of any length.
     angle_deg
-        Angle between axis and flank, in degrees, between 0 and 90.  The cone of a CPT has 30 degrees.
+        Angle between axis and flank, half the apex angle, in degrees, between 0 and 90.  The cone of a CPT has 30
+        degrees.
     """
 
     tip: ArrayLike

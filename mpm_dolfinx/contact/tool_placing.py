@@ -228,6 +228,10 @@ class Tools(Touching):
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         return ContactLaw(self.names, self.tools, pairs), origin
 
+    def _cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return positions divided by the cell size."""
+        return x / self.grid.h if self.grid.even else self.grid.in_cells(x)
+
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
@@ -246,11 +250,7 @@ class Tools(Touching):
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
-
-        def cells(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return positions divided by the cell size."""
-            return x / grid.h if grid.even else grid.in_cells(x)
-
+        cells = self._cells
         low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
         off = ~faces & (np.abs(np.clip(cells(x), low, high) - cells(x)) <= 1).all(axis=1)
         beyond = np.concatenate(grid.comm.allgather(np.hstack([cells(x[off]), unit[off]])))
@@ -276,6 +276,31 @@ class Tools(Touching):
             if tool.mass < half:
                 what = "%s: its mass is less than that of half a cell, %.3g kg, so its rebound depends on the step in "
                 warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
+
+    def warn_missed(self, place: Place, points: MaterialPoints) -> None:
+        """Warn of tools without contact, if a tip or corner moves deeper into a body than all positions near it."""
+        grid, patches = self.grid, place.cut.surface(self.outside)
+        for name, tool in zip(self.names, self.tools, strict=True):
+            touches = over_all(grid.comm, int((points.data[pressure_name(name)] > 0).any()))
+            if touches or callable(tool.shape):
+                continue
+            before, tips = (self._pose(tool, t).put(tool.solid(grid.least).places) for t in (place.start, place.t))
+            at = self._cells(tips)
+            x, area = patches.now(points), patches.area(points)
+            near = ((self._cells(x) > at.min(axis=0) - 1) & (self._cells(x) < at.max(axis=0) + 1)).all(axis=1)
+            x, area = x[near], area[near]
+            pairs = cKDTree(at).sparse_distance_matrix(cKDTree(self._cells(x)), 1.0, output_type="ndarray")
+            tip, face = pairs["i"], pairs["j"]
+            n, depth = np.zeros_like(tips), np.full(len(tips), np.inf)
+            np.add.at(n, tip, area[face])
+            n = over_all(grid.comm, n)
+            n /= np.maximum(np.linalg.norm(n, axis=1), TINY)[:, None]
+            np.minimum.at(depth, tip, np.einsum("md,md->m", x[face] - tips[tip], n[tip]))
+            depth = over_all(grid.comm, depth, MPI.MIN)
+            inwards = (n * (tips - before)).sum(axis=1) < 0
+            if (inwards & np.isfinite(depth) & (depth > MISFIT * grid.least)).any():
+                what = "%s: a tip or corner is deeper in a body than all contact positions near it, without a force; "
+                warn(grid.comm, ResolutionWarning, what + "use cells smaller than %.3g m", line(tool), grid.least)
 
     def check_start(self, place: Place) -> None:
         """Raise an error for tools inside a body at the start of the stage."""
@@ -444,6 +469,12 @@ class ToolLoads(ContactProblem):
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
         """See `Loads`."""
         self._tools.check_end(self._place, points, before)
+
+    def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
+        """See `Loads`."""
+        points = super().gripped(at, points)
+        self._tools.warn_missed(self._place, points)
+        return points
 
 
 class MovedToolLoads(MovedTools, ToolLoads):

@@ -14,7 +14,7 @@ from mpm_dolfinx.bodies.bodies import Body, Later, Moving, check_bodies
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.grid.grid import Grid, begin_with
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
-from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, warn
 
 
 def checked_parts(
@@ -27,6 +27,11 @@ def checked_parts(
     later = [i for i, body in enumerate(bodies) if isinstance(body, Later)]
     bodies = [body.body if isinstance(body, Later) else body for body in bodies]
     check_bodies(grid, bodies)
+    for i, one in enumerate(materials):
+        friction = getattr(one, "friction", None)
+        if not (friction is None or callable(friction)) and 0 < np.max(friction) < 1:
+            what = "material %d: friction = %.3g degrees, less than 1; must be in degrees, not in radians"
+            warn(grid.comm, ConditionWarning, what, i, np.max(friction))
     return bodies, later
 
 

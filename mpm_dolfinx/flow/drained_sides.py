@@ -16,7 +16,7 @@ outflow at the pressure `Rain.driest`.  In a step of length dt, a pond of volume
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -67,18 +67,11 @@ class DrainedSides(Feeding):
         return [faces for _, faces in self._outlets]
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return placeholders before the first step: `value` for outflows and run-offs, and zero for volumes."""
-
-        def of_all(value: float) -> dict[str, NDArray[np.float64]]:
-            return {name: np.array(value) for name in self._names}
-
-        def of_rains(value: float) -> dict[str, NDArray[np.float64]]:
-            return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
-
-        if not any(self._rains):
-            return {"outflows": of_all(value)}
-        volumes = {"flowed": of_all(0.0), "ran_off": of_rains(0.0), "ponded": of_rains(0.0)}
-        return {"outflows": of_all(value), "runoff": of_rains(value)} | volumes
+        """Return placeholders before the first step: `value` for rates, and zero for volumes."""
+        out = {"outflows": {name: np.array(value) for name in self._names}}
+        rains = [name for name, rain in zip(self._names, self._rains, strict=True) if rain]
+        start = {"rain": value, "runoff": value, "ran_off": 0.0, "ponded": 0.0} if rains else {}
+        return out | {quantity: {name: np.array(one) for name in rains} for quantity, one in start.items()}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
         """Return the indices of points with faces on open sides.  Indices may be repeated."""
@@ -322,45 +315,37 @@ class SideFeeds(Feeds):
         return changes
 
     def outcome(self, at: OpenFaces, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outflow through the sides of each condition, and with rain the run-off, in m^d/s.
+        """Return the outflow through the sides of each condition, and with rain the rain and the run-off, in m^d/s.
 
         Run-off is rain that neither infiltrates nor fills a pond.
         """
-        through = self._through(at, fluid)
-        sums = over_all(self._comm, sum_by(self.sides.number, through, len(self._names)))
-        out = {"outflows": {name: np.array(sums[i]) for i, name in enumerate(self._names)}}
+        rows = through = self._through(at, fluid)
+        if any(self._rains):  # nan without rain
+            excess = np.maximum(self._fallen, 0.0) + np.minimum(through, 0.0)
+            rows = np.stack([through, self._fallen, excess])
+        sums = over_all(self._comm, sum_by(self.sides.number, rows, len(self._names)))
         if not any(self._rains):
-            return out
-        excess = np.maximum(self._fallen, 0.0) + np.minimum(through, 0.0)  # nan without rain
-        runs = over_all(self._comm, sum_by(self.sides.number, excess, len(self._names)))
+            return {"outflows": dict(zip(self._names, sums, strict=True))}
+        out, rain, runs = sums
         runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # < 0 if a pond supplies the soil
-        return out | {"runoff": {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}}
-
-    def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rates (2,) of outflow and rain for each condition, in m^d/s."""
-        if not any(self._rains):
-            return {}
-        both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
-        sums = over_all(self._comm, np.stack([sum_by(self.sides.number, row, len(self._names)) for row in both]))
-        return dict(zip(self._names, sums.T, strict=True))
+        found = {"outflows": dict(zip(self._names, out, strict=True)), "rain": {}, "runoff": {}}
+        for name, rains, *of in zip(self._names, self._rains, rain, runs, strict=True):
+            if rains:
+                found["rain"][name], found["runoff"][name] = of
+        return found
 
     def volumes(
-        self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
+        self, now: Mapping[str, Mapping[str, NDArray[np.float64]]]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow, run-off and ponded water, in m^d."""
+        """Return the ponded water, and the total of run-off and seepage from sides with rain, in m^d."""
         if not any(self._rains):
             return {}
-        flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])
-        before = {quantity: self._before.get(quantity, {}) for quantity in ("flowed", "ran_off")}
-        available = self._ponded + rained + flowed
-        ponded = available.clip(0, self._most)
-        more = {"flowed": flowed, "ran_off": np.maximum(available - ponded, 0.0)}
-        out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "flowed": {}, "ran_off": {}}
-        for i, name in enumerate(self._names):
-            for quantity in more if self._rains[i] else ("flowed",):
-                out[quantity][name] = before[quantity].get(name, 0.0) + more[quantity][i]
-            if self._rains[i]:
-                out["ponded"][name] = np.array(ponded[i])
+        out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "ran_off": {}}
+        for name, rains, most in zip(self._names, self._rains, self._most, strict=True):
+            if rains:
+                free = now["rained"][name] + now["flowed"][name]  # rain that did not infiltrate
+                out["ponded"][name] = np.clip(free - self._before["ran_off"][name], 0.0, most)
+                out["ran_off"][name] = free - out["ponded"][name]
         return out
 
     def _if_open(self, at: OpenFaces, values: NDArray[np.float64]) -> NDArray[np.float64]:

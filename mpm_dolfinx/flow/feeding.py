@@ -101,20 +101,16 @@ class Feeds:
 
     def outcome(self, at: Any, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return results of the conditions, by quantity and name, such as "outflows": the outflow from the bodies, in
-        m^d/s.  All processes must call this method.
+        m^d/s.  All processes must call this method after each substep.
         """
         return {}
 
-    def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the flow rates in a substep, for the method `volumes`.  All processes must call this method."""
-        return {}
-
     def volumes(
-        self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
+        self, now: Mapping[str, Mapping[str, NDArray[np.float64]]]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes (m^d) since the start of the conditions, by quantity and condition.
+        """Return further volumes (m^d) at the end of a step, by quantity and condition.
 
-        `rates`: results of `passing` in the substeps of a step.  `seconds`, s: time weights of these substeps.
+        `now`: results of all conditions at the end of the step.  They contain the time integrals `acting.VOLUMES`.
         """
         return {}
 

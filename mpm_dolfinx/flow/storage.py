@@ -466,17 +466,12 @@ class StorageProblem:
                 out[quantity] = out.get(quantity, {}) | values
         return out
 
-    def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the flow rates of the conditions in a converged substep, for the method `volumes`."""
-        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
-        return [one.passing(at, fluid) for one, at in both]
-
-    def volumes(self, rates: Sequence[Sequence[Mapping]], seconds: Sequence[float]) -> dict[str, dict]:
-        """Return volumes since the start of the conditions, see `Feeds.volumes`."""
-        found = [one.volumes(of, seconds) for one, of in zip(self._feeds, zip(*rates, strict=True), strict=True)]
-        out: dict[str, dict] = {}
-        for quantity, of in (pair for one in found for pair in one.items()):
-            out[quantity] = out.get(quantity, {}) | of
+    def volumes(self, now: Mapping[str, Mapping]) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return further volumes at the end of a step, by quantity and name, see `Feeds.volumes`."""
+        out: dict[str, dict[str, NDArray[np.float64]]] = {}
+        for one in self._feeds:
+            for quantity, values in one.volumes(now).items():
+                out[quantity] = out.get(quantity, {}) | values
         return out
 
     @property

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
-from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
+from mpm_dolfinx.conditions.acting import IMPULSES, MOTIONS, VOLUMES, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.domains.renewed_faces import PARENT, ROOT, with_faces, with_parts
 from mpm_dolfinx.grid.grid import Grid
@@ -39,7 +39,7 @@ from mpm_dolfinx.stepping.distribution import distribute_by
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import NODAL, State, Stay, StepControl, Trend
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 16  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 17  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 POINTS, PIECES = "points/id", "pieces/id"
@@ -270,7 +270,8 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
                 continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
                 raise ValueError(f"outcome/{quantity}/{name}: wrong type or shape ({value.dtype}, {value.shape})")
-            if quantity in ("tool_travel", *MOTIONS) and not np.isfinite(value).all():
+            sums = *VOLUMES.values(), *IMPULSES.values(), "ran_off", "ponded", "tool_travel", *MOTIONS
+            if quantity in sums and not np.isfinite(value).all():
                 raise ValueError(f"outcome/{quantity}/{name} is not finite")
     return found
 

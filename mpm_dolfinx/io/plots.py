@@ -70,6 +70,8 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
         known = unit("pressure" if field == "suction" else field)
         label = label or field.replace("_", " ") + (f" ({known})" if known else "")
         cax = ax.inset_axes(bounds=(1.03, 0, 0.04, 1))  # as high as the axes, which may be flat
+        if ax.figure.get_layout_engine() is None:  # all other layouts make room for the bar and its numbers
+            ax.figure.subplots_adjust(right=min(ax.figure.subplotpars.right, 0.75))
         ax.figure.colorbar(drawn, cax=cax).ax.set_title(label, loc="right", fontsize="medium")
     return ax
 

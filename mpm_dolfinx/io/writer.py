@@ -32,7 +32,7 @@ from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, together
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
-from mpm_dolfinx.stepping.result import Result
+from mpm_dolfinx.stepping.result import OUTCOMES, Result
 
 if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
@@ -92,7 +92,7 @@ class Writer:
         self.closed = False
         """Whether the writer has released the lock of its folder."""
         tools = simulation.state.stage.of(Tool)
-        own = tuple(f"{quantity.removesuffix('s')}_" for quantity in simulation.state.outcome)
+        own = tuple(f"{quantity.removesuffix('s')}_" for quantity in (*OUTCOMES, *simulation.state.outcome))
         with on_disk("writer: folder", "writable"):
             self._lock: Lock | None = None
             at_root(comm, lambda: self._hold(folder))

@@ -86,7 +86,9 @@ class ModifiedCamClay(Skeleton):
         the Cauchy stress, the slope of ln v against ln P is C / (v - C).
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
-        in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
+        in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.  For bodies
+        with an `initial_stress` of the scene, such as `K0`, the stress of the scene replaces these stresses, and any
+        values with a mean < 0 have the same results.
     OCR
         Overconsolidation ratio, -, >= 1: initial size P_c of the yield surface, divided by the size of the yield
         surface that passes through the initial stress.

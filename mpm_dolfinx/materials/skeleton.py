@@ -169,6 +169,13 @@ class Skeleton:
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of fields and properties that are arguments of the law's functions."""
 
+    def __new__(cls, *args, **given):
+        """Create the material.  Raise TypeError with formulas for Young's modulus and Poisson's ratio."""
+        if wrong := [name for name in ("E", "nu") if name in given and name not in cls.__dataclass_fields__]:
+            what = f"{cls.__name__}: {wrong[0]} = {line(given[wrong[0]])} is no constant"
+            raise TypeError(f"{what}, must be given as bulk = E / (3 - 6 nu) and shear = E / (2 + 2 nu)")
+        return super().__new__(cls)
+
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
         for name in ("state", "unknowns"):

@@ -567,7 +567,7 @@ class MomentumProblem:
         return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
 
     def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the reactions and outflows of the conditions at u, by quantity and name of the condition."""
+        """Return the reactions and other results of the conditions at u, by quantity and name."""
         out: dict[str, dict[str, NDArray[np.float64]]] = {}
         for one in self.loads:
             for quantity, values in one.outcome(self.at).items():

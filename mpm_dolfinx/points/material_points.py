@@ -146,6 +146,14 @@ class MaterialPoints:
 
         return own | {"corners": corners, "x": x, "origin": of(self.origin), "reference": of(self.reference)}
 
+    def __getattr__(self, name: str):
+        """Raise AttributeError for an unknown name.  The message lists the names of all fields."""
+        if name.startswith("__") or "data" not in vars(self):  # during a copy
+            raise AttributeError(name)
+        own = ", ".join([*(f.name for f in fields(self)), "J", "displacement"])
+        data = ", ".join(key for key in self.data if key not in self.INTERNAL)
+        raise AttributeError(f"points: {name!r}, must be one of {own}" + f"; data has {data}" * bool(data))
+
     def __repr__(self) -> str:
         """Return one line with the number of points, their reference volume, and the ranges of J and pressure."""
         own = [f"{len(self)} points in {self.F.shape[1]}D"]

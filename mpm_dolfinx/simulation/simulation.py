@@ -38,7 +38,7 @@ from mpm_dolfinx.simulation.timeloop import run
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
-from mpm_dolfinx.stepping.result import Result
+from mpm_dolfinx.stepping.result import OUTCOMES, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked, contacts_of
 from mpm_dolfinx.stepping.state import State
@@ -58,9 +58,9 @@ class Simulation:
         Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the displacement
         components that they fix, such as {"left": "xy", "bottom": "y"}.
     conditions
-        Conditions on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
-        `Inflow` on their sides, rigid `Tool`s, and `Contact`s between groups of bodies. Sides without a condition are
-        free of traction and undrained.
+        Conditions on the bodies, in any order: on their sides `Traction`, `Pressure`, `Displacement`, `RigidPlate`,
+        `Quiet`, `Tied`, `Drained`, `Inflow`, `Rain` and the two conditions of `water`; rigid `Tool`s; and `Contact`s
+        between groups of bodies. Sides without a condition are free of traction and undrained.
     fluid
         Pore fluid; None for a dry scene.
     gravity : (d,) or callable t -> (d,), m/s^2
@@ -243,16 +243,19 @@ class Simulation:
         """Return one quantity, such as "reactions", at the end of the last step, for each condition by its name.
 
         User-defined conditions are included.  The dictionary is empty if no condition of the stage has this quantity.
+        Time integrals since the start of a condition have the weights of the time integration.  "flowed" is the volume
+        of outflow, in m^3 (m^2 in plane strain).  With inertia, "impulse" is the integral of the forces `reactions` and
+        `tool_forces`, and "wall_impulse" of `wall_reactions`, in N s (N s/m in plane strain).
 
         Raises
         ------
         KeyError
             The quantity is unknown.  The message lists the known quantities.
         """
-        known = dict.fromkeys([*self.state.stage.quantities, *self.state.outcome])
+        known = dict.fromkeys([*OUTCOMES, *self.state.outcome])
         if quantity not in known:
             raise KeyError(f"outcome: quantity = {line(quantity)}, must be one of {', '.join(known)}")
-        return ByName(self.state.outcome.get(quantity, {}))
+        return ByName({name: np.asarray(of)[()] for name, of in self.state.outcome.get(quantity, {}).items()})
 
     @property
     def present(self) -> tuple[bool, ...]:

@@ -83,6 +83,10 @@ class Safety:
     overloads: Mapping[float, NDArray[np.float64]]
     newton: int
 
+    def __str__(self) -> str:
+        """Return the factor and its bounds."""
+        return f"factor of safety {self.factor:.3f}, between {self.bounds[0]:.3f} and {self.bounds[1]:.3f}"
+
 
 def factor_of_safety(
     simulation: Simulation, *, dt: float | None = None, rtol: float = 0.01, steps: int = 10, progress: bool = True

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain
 from operator import attrgetter
@@ -94,20 +94,30 @@ class Balances(NamedTuple):
         acceleration = self.inertia.acceleration(self.momentum.at)
         return flight.after(acceleration, float(substep.own * dt), float(substep.before * dt))
 
-    def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the flow through open sides at the end of the substep."""
-        return self.storage.passing() if self.storage else []
+    def results(self, state: State, last: bool) -> Outcome:
+        """Return the results of conditions at the end of a substep, by quantity and name.
 
-    def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
-        """Return the results of conditions at the end of a step, by quantity and name.
+        `last`: whether the substep is the last one.  All others need only the results that are integrated.
+        """
+        out = self.storage.outcome() if self.storage else {}
+        if last or self.inertia:
+            out |= self.momentum.outcome()
+            out["wall_reactions"] = self.momentum.wall_forces(state.stage.conditions["walls"])
+        return out
 
-        `passed`: results of `passing` for each substep.
+    def outcome(self, state: State, found: Sequence[Outcome], seconds: NDArray[np.float64]) -> Outcome:
+        """Return the results of conditions at the end of a step, by quantity and name, with their time integrals.
+
+        `found`: results of each substep.
         `seconds`, s: time weights of the substeps.
         """
-        stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
-        out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
-        out |= self.storage.outcome() if self.storage else {"outflows": {}}
-        return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
+        out = {quantity: {} for quantity in QUANTITIES} | found[-1]
+        for weight, of in zip(seconds[-len(found) :], found, strict=True):
+            for quantity, total in state.stage.totals.items():
+                for name, rate in of.get(quantity, {}).items():
+                    sums = out.setdefault(total, dict(state.outcome.get(total, {})))
+                    sums[name] = sums.get(name, 0.0) + weight * rate
+        return out | (self.storage.volumes(out) if self.storage else {})
 
     def net_inflow(self, rates: Rates | None) -> NDArray[np.float64] | None:
         """Return the net inflow of fluid into the cells in the step, or None without fluid."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.tables import data_frame, data_set
-from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES
+from mpm_dolfinx.conditions.acting import IMPULSES, MOTIONS, OF_RAIN, QUANTITIES, VOLUMES
 from mpm_dolfinx.conditions.names import ByName
 
-OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", *OF_RAIN)
+OUTCOMES = tuple(dict.fromkeys([*QUANTITIES, *VOLUMES.values(), *OF_RAIN, *MOTIONS, *IMPULSES.values(), "energy"]))
 """Names of the results of the package's conditions. User-defined conditions may have other results."""
 
 

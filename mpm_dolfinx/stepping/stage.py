@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, get_args
 
 import numpy as np
@@ -15,7 +16,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.validation import all_of, check_names, given, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES, Acting, Loads, Outcome, Place, Setting
+from mpm_dolfinx.conditions.acting import IMPULSES, QUANTITIES, VOLUMES, Acting, Loads, Outcome, Place, Setting
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
     Drained,
@@ -213,10 +214,10 @@ class Stage:
         """Faces of conditions that depend on displacements since seeding. Their domains must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
-    @property
-    def quantities(self) -> tuple[str, ...]:
-        """Names of the results of conditions."""
-        return QUANTITIES + OF_RAIN + MOTIONS
+    @cached_property
+    def totals(self) -> Mapping[str, str]:
+        """Names of the time integrals since the start of the conditions, by the names of their integrands."""
+        return VOLUMES | IMPULSES if self.inertia else VOLUMES
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return placeholders `value` for results of conditions before the first step, by quantity and name."""
@@ -226,6 +227,9 @@ class Stage:
         for one in (*self.feeding, *self.acting):
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values
+        for quantity, total in self.totals.items():
+            if out.get(quantity):
+                out[total] = out.get(total, {}) | {name: np.zeros_like(of) for name, of in out[quantity].items()}
         return out
 
     def initial_outcome(

@@ -146,7 +146,8 @@ class State:
         `wall_reactions` (d,), N: forces of the grid's walls on the bodies. `outflows`, m^3/s (m^2/s in plane strain):
         flow through open sides and conducting contacts, as volumes at zero pressure. `tool_forces` (3,), in 3D (6,):
         forces (N) and moments (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a tool due
-        to forces. User-defined conditions may have other quantities.
+        to forces. `flowed`, m^3 (m^2): integral of `outflows`. `impulse` and `wall_impulse`, N s: integrals of forces
+        with inertia. User-defined conditions may have other quantities.
     stage
         The present stage, with its conditions.
     begins

@@ -59,7 +59,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         problem = both.momentum, both.storage, both.ahead, partial(on_grid.as_reset, state)
         rates.append(solve_substep(start.matrices.solvers, *problem, key, report, kept))
-        passed.append(both.passing())
+        passed.append(both.results(state, placed is start.acting[-1]))
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
