@@ -205,17 +205,15 @@ class RainedFaces(OpenFaces):
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow (m,) through each face, in m^d/s."""
         ponded = self.pond.outflow(fluid)
-        return np.where(
-            np.isnan(self.rain), ponded, np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
-        )
+        rained = np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
+        return np.where(np.isnan(self.rain), ponded, rained)
 
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction.  Faces with rain have no correction."""
-        return tuple(
-            np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
-        )
+        dry = np.isnan(self.rain)
+        return tuple(np.where(dry, values, 0.0) for values in self.pond.nonorthogonal(fluid, difference))
 
     def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative (m, d) of `driven` with respect to the inertia force, or zero for faces with rain."""
@@ -241,14 +239,14 @@ class SideFeeds(Feeds):
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
-        self._rains = [depth is not None for depth in ponds]
         self._names, self._before = names, wet.outcome
         self._at, self._comm = wet.contents.slot(sides.cells), wet.cut.grid.comm
-        self._fallen = sides.rain
+        self._ponds, self._fallen = ponds, sides.rain
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
-        self.settles = bool(self._seeps.any())
-        self.linear = not any(self._rains)
+        self.settles = bool(np.logical_or.reduce(self._seeps))
+        self.passes = ponds.count(None) < len(ponds)
+        self.linear = not self.passes
         self._drain = wet.drains
         self._flows, self._nonorthogonal = True, 0.0
         self._share: NDArray[np.float64] | float = 0.0
@@ -272,25 +270,19 @@ class SideFeeds(Feeds):
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
-    def conducting(self, flow: Conduction) -> OpenFaces:
-        """Return the faces with their conductances."""
-        faces = self._faces(self.sides, flow)
-        if not any(self._rains):
-            return faces
-        driest = np.where(np.isnan(self.sides.driest), self.sides.pressure, self.sides.driest)
-        dry = self._faces(replace(self.sides, pressure=driest), flow)
-        same = (faces.at, faces.conductance, faces.inflow, faces.seeps, faces.offset)
-        return RainedFaces(*same, self.sides.rain, faces, dry)
-
-    def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
-        """Return the faces with their conductances for the outside pressures in `sides`."""
-        at = self._at
+    def conducting(self, flow: Conduction, driest: NDArray[np.float64] | None = None) -> OpenFaces:
+        """Return the faces with their conductances.  `driest` (m,), Pa: pressure outside in place of the pond's."""
+        at, sides = self._at, self.sides if driest is None else replace(self.sides, pressure=driest)
         (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
-        if flow.relative is None:
-            return OpenFaces(at, conductance, inflow, self._seeps, offset)
-        drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight
-        rest = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, drop
-        return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
+        faces = OpenFaces(at, conductance, inflow, self._seeps, offset)
+        if flow.relative is not None:
+            drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight
+            rest = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, drop
+            faces = UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
+        if self.linear or driest is not None:
+            return faces
+        dry = self.conducting(flow, np.where(np.isnan(sides.driest), sides.pressure, sides.driest))
+        return RainedFaces(at, conductance, faces.inflow, self._seeps, offset, sides.rain, faces, dry)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """See `Feeds`.  Seepage faces with an outflow are opened."""
@@ -329,17 +321,16 @@ class SideFeeds(Feeds):
         through = self._through(at, fluid)
         sums = over_all(self._comm, sum_by(self.sides.number, through, len(self._names)))
         out = {"outflows": {name: np.array(sums[i]) for i, name in enumerate(self._names)}}
-        if not any(self._rains):
+        if not self.passes:
             return out
         excess = np.maximum(self._fallen, 0.0) + np.minimum(through, 0.0)  # nan without rain
         runs = over_all(self._comm, sum_by(self.sides.number, excess, len(self._names)))
         runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # < 0 if a pond supplies the soil
-        return out | {"runoff": {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}}
+        rains = [i for i, depth in enumerate(self._ponds) if depth is not None]
+        return out | {"runoff": {self._names[i]: np.array(runs[i]) for i in rains}}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
         """Return for each condition the rates (2,) of outflow and rain, in m^d/s."""
-        if not any(self._rains):
-            return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
         sums = over_all(self._comm, np.stack([sum_by(self.sides.number, row, len(self._names)) for row in both]))
         return dict(zip(self._names, sums.T, strict=True))
@@ -348,7 +339,7 @@ class SideFeeds(Feeds):
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the volumes of outflow, run-off and ponded water, in m^d."""
-        if not any(self._rains):
+        if not self.passes:
             return {}
         flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])
         before = {quantity: self._before.get(quantity, {}) for quantity in ("flowed", "ran_off")}
@@ -357,9 +348,9 @@ class SideFeeds(Feeds):
         more = {"flowed": flowed, "ran_off": np.maximum(available - ponded, 0.0)}
         out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "flowed": {}, "ran_off": {}}
         for i, name in enumerate(self._names):
-            for quantity in more if self._rains[i] else ("flowed",):
+            for quantity in more if self._ponds[i] is not None else ("flowed",):
                 out[quantity][name] = before[quantity].get(name, 0.0) + more[quantity][i]
-            if self._rains[i]:
+            if self._ponds[i] is not None:
                 out["ponded"][name] = np.array(ponded[i])
         return out
 

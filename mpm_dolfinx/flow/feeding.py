@@ -68,6 +68,8 @@ class Feeds:
     """Whether the outflow is always linear in the mass potentials pi (see `fluid_content`)."""
     settles: bool = False
     """Whether the condition has an active set, which `settle` updates."""
+    passes: bool = False
+    """Whether `passing` returns rates."""
     sides: OpenSides | None = None
     """Faces with an outside pressure or a prescribed flux."""
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, get_args
 
 import numpy as np
@@ -130,7 +131,7 @@ class Stage:
         """Whether bodies have inertia."""
         return self.conditions["inertia"]
 
-    @property
+    @cached_property
     def surfaces(self) -> list[Surface]:
         """Faces of all conditions except tools and contacts."""
         return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
