@@ -2,7 +2,7 @@
 """Small scenes that several tests share."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -156,6 +156,11 @@ def imbalance(s, before, soil, gravity):
     tools = (force[: s.grid.dim] for force in s.tool_forces.values())
     forces = np.array([*s.wall_reactions.values(), *s.reactions.values(), *tools, mass * np.array(gravity)])
     return np.abs(forces.sum(axis=0)).max() / np.abs(forces).max()
+
+
+def arrays_of(points):
+    """Return all arrays of material points by name."""
+    return {f.name: getattr(points, f.name) for f in fields(points) if f.name != "data"} | dict(points.data)
 
 
 def gathered(simulation, **columns):

@@ -11,7 +11,7 @@ import sys
 from petsc4py import PETSc
 
 import numpy as np
-from helpers import beam
+from helpers import arrays_of, beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.parallel.exchange import to_root
@@ -22,7 +22,8 @@ T_END, DT = 0.12, 0.02
 def state(simulation):
     """Return all points on process 0, and the histories."""
     points = simulation.points.migrated(to_root(simulation.grid.comm, len(simulation.points)))
-    return {**{name: a for name, a in vars(points).items() if name != "data"}, "tip": simulation.result.displacement}
+    own = {name: a for name, a in arrays_of(points).items() if name not in points.data}
+    return {**own, "tip": simulation.result.displacement}
 
 
 def to_the_end(simulation, probe, file):

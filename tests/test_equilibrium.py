@@ -6,7 +6,8 @@ import pytest
 from helpers import SOFT, beam, column, joined, without
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.conditions.walls import wall_forces
+from mpm_dolfinx.conditions.walls import wall_shares
+from mpm_dolfinx.grid.grid import SIDES, sum_by
 from mpm_dolfinx.io.checkpoint import save
 
 SOIL = mpm.Hencky(bulk=2e8, shear=1e8, porosity=0.4, conductivity=1e-5, grain_density=2650)
@@ -211,7 +212,8 @@ def test_what_several_walls_hold_counts_once():
     on_walls = np.flatnonzero((np.abs(grid.node_x[:, :2] - 0.5) > 0.4).any(axis=1))
     dofs = (3 * on_walls[:, None] + np.arange(3)).ravel()
     for order in (("left", "right", "front", "back"), ("back", "front", "right", "left")):
-        walls = wall_forces(grid, dict.fromkeys(order, "xyz"), dofs, np.ones(len(dofs)))
+        shares = wall_shares(grid, dict.fromkeys(order, "xyz"), dofs)
+        walls = dict(zip(SIDES[3], sum_by(dofs % 3, shares, 3), strict=True))
         for wall in ("left", "right"):  # 9 nodes, 6 of them on edges
             assert walls[wall].tolist() == [9, 3, 3 + 6 / 2]
         for wall in ("front", "back"):

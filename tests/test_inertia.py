@@ -369,7 +369,7 @@ def test_the_tangent_contains_the_acceleration_of_the_water(kind):
     system.change_by(v, out)
     system.B_momentum.mult(v, content)
     for step in (1e-7, -2e-7):
-        unknowns.add(u, step, v)
+        unknowns.add(u.x, step, v)
         there.append(storage.assemble_residual().vector.array.copy())
     exact = (there[0] - there[1]) / 2e-7
     assert out.array == pytest.approx(exact, abs=1e-6 * np.abs(exact).max())

@@ -160,7 +160,7 @@ def test_what_fluxes_gain_by_displacements_is_what_their_residual_does():
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.9, 0.8])], [soil], conditions=[mpm.Drained("right")], **options)
     _, momentum, storage = set_up(s, 10.0)
     system, unknowns, u = storage.system, momentum.system.unknowns, momentum.forms.u
-    move = lambda v, scale: unknowns.add(u, scale, v)  # noqa: E731
+    move = lambda v, scale: unknowns.add(u.x, scale, v)  # noqa: E731
     bent, v = (unknowns.gather_owned(size * rng.standard_normal(unknowns.size)) for size in (0.01, 1.0))
     move(bent, 1.0)
     storage.assemble_tangent()

@@ -50,7 +50,7 @@ class SpringsOfStage(mpm.Acting):
 
 
 class SpringLoads(mpm.Loads):
-    varies, holding = True, True
+    holding = True
 
     def __init__(self, of, forms, data):
         self.of, self.forms, self.data = of, forms, data

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from helpers import beam, limit, set_up
+from helpers import arrays_of, beam, limit, set_up
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
@@ -68,12 +68,12 @@ def same_bits(a: mpm.State, b: mpm.State) -> None:
 
 def contents(state):
     """Return all arrays of a state by their names."""
-    out = {f"points {k}": v for k, v in {**vars(state.points), **state.points.data}.items() if k != "data"}
+    out = {f"points {k}": v for k, v in arrays_of(state.points).items()}
     out |= {f"{what} {name}": value for what, of in state.outcome.items() for name, value in of.items()}
     if state.pieces is not None:
         out |= {f"pieces {name}": rows for name, rows in state.pieces.arrays.items()}
     if state.stay is not None:
-        out |= {f"stay {k}": v for k, v in {**vars(state.stay.points), **state.stay.points.data}.items() if k != "data"}
+        out |= {f"stay {k}": v for k, v in arrays_of(state.stay.points).items()}
         out |= {} if state.stay.keeps is None else {"keeps": state.stay.keeps}
     return out
 

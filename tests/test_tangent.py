@@ -32,9 +32,9 @@ def test_products_of_the_tangent_are_what_residuals_change_by(fluid):
     dp = 1e5 * rng.standard_normal(len(found.cells)) if fluid else None
     forces, fluids, unknowns = [], [], momentum.system.unknowns
     for step in (1e-6, -2e-6):
-        unknowns.add(u, step, unknowns.gather_owned(du))
+        unknowns.add(u.x, step, unknowns.gather_owned(du))
         if fluid:
-            storage.system.unknowns.add(storage.forms.p, step, storage.system.unknowns.gather_owned(dp))
+            storage.system.unknowns.add(storage.forms.p.x, step, storage.system.unknowns.gather_owned(dp))
             fluids.append(storage.assemble_residual().vector.array.copy())
         forces.append(momentum.assemble_residual()[0].array.copy())
     forces, fluids = ((of[0] - of[1]) / 2e-6 if of else None for of in (forces, fluids))

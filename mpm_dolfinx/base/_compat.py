@@ -134,12 +134,11 @@ seconds: Counter[str] = Counter()
 class Timer:
     """Context that adds its wall time to an entry of `seconds`.  The timers of dolfinx 0.9 resolve only 10 ms."""
 
+    __enter__ = staticmethod(perf_counter)  # only `__init__` keeps the time
+
     def __init__(self, part: str):
         self._part = part
         self._start = perf_counter()
-
-    def __enter__(self) -> None:
-        pass
 
     def __exit__(self, *_: object) -> None:
         seconds[self._part] += perf_counter() - self._start
@@ -180,6 +179,10 @@ class CompiledForm:
             self._all = coefficients
         self.coefficients = [coefficients[position[i]] for i in range(count)]
         self._last = None
+        if OLD:
+            address = self._module.ffi.cast("uintptr_t", self._module.ffi.addressof(self._ufcx))
+            several = self._spaces, self.coefficients, self._constants
+            self._parts = int(address), *([one._cpp_object for one in of] for of in several)
 
     @property
     def form(self):
@@ -198,16 +201,7 @@ class CompiledForm:
         if OLD:
             values = np.full(len(entities), SUBDOMAIN, dtype=np.int32)
             tags = cpp.mesh.MeshTags_int32(self.mesh, dim, entities, values)
-            ffi = self._module.ffi
-            form = cpp.fem.Form_float64(
-                int(ffi.cast("uintptr_t", ffi.addressof(self._ufcx))),
-                [V._cpp_object for V in self._spaces],
-                [c._cpp_object for c in self.coefficients],
-                [c._cpp_object for c in self._constants],
-                {kind: tags},
-                self.mesh,
-            )
-            self._last = form
+            self._last = cpp.fem.Form_float64(*self._parts, {kind: tags}, self.mesh)
         else:
             if not cells:
                 entities = _facet_cells(self.mesh, entities, dim)

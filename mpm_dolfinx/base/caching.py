@@ -41,7 +41,9 @@ class Latest(Generic[T]):
         """
         other = self._key is not key and (self._key is EMPTY or not same(self._key, key))
         if other if comm.size == 1 else over_all(comm, other) > 0:
-            self.clear()
+            self._key, self.value = EMPTY, None
+            for one in self._derived:
+                one.clear()
             self.value = make()
         self._key = key  # the next call mostly has the same objects in its key
         return self.value

@@ -25,21 +25,22 @@ longer than a vector.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from inspect import Parameter, signature
+from inspect import signature
 from math import inf
 from pathlib import Path
 from types import FunctionType, MethodType
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 LONGEST = 160  # largest number of characters of a value in a message
-_known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
-"""Cache of the results of `_parameters` for each function."""
+_known: WeakKeyDictionary[Callable, _Arguments] = WeakKeyDictionary()
+"""Cache of the arguments of each function."""
 
 
 def line(value) -> str:
@@ -181,8 +182,20 @@ def _plain(function: Callable) -> bool:
     return (isinstance(function, PLAIN) and not library) or own
 
 
-def _parameters(function: Callable) -> list[Parameter] | None:
-    """Return the parameters to which `called` passes arguments, or None if Python cannot determine them."""
+class _Arguments(NamedTuple):
+    """Arguments that a function receives."""
+
+    parameters: tuple[str, ...]  # names of the parameters that receive arguments
+    names: tuple[str, ...] | None  # see `takes`
+    alone: Mapping[str, str]  # parameters that are keywords only, and their names among t, X and x
+    positional: tuple[str, ...]  # names among t, X and x of the other parameters, in their order
+
+
+_OF_TIME = _Arguments((), ("t",), {}, ("t",))  # of functions whose parameters Python does not know
+
+
+def _arguments(function: Callable) -> _Arguments:
+    """Return the arguments that `called` passes to a function."""
     try:
         return _known[function]
     except (KeyError, TypeError):  # some objects have no hash
@@ -190,11 +203,18 @@ def _parameters(function: Callable) -> list[Parameter] | None:
     try:
         every = list(signature(function).parameters.values())
     except (TypeError, ValueError):  # some built-in functions
-        return None
+        return _OF_TIME
     named = [p for p in every if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     if not named and any(p.kind == p.VAR_POSITIONAL for p in every):
-        return None
-    out = [p for p in named if p.default is p.empty] or named
+        return _OF_TIME
+    given = [p for p in named if p.default is p.empty] or named
+    parameters = tuple([p.name for p in given])
+    names = ("t",) if len(given) == 1 and parameters[0] not in PLACES else parameters
+    if not names or not set(names) <= set(NAMES) or (names == ("x",) and not _plain(function)):
+        names = None
+    alone = {p.name: name for p, name in zip(given, names or (), strict=False) if p.kind == p.KEYWORD_ONLY}
+    positional = tuple([name for p, name in zip(parameters, names or (), strict=False) if p not in alone])
+    out = _Arguments(parameters, names, alone, positional)
     with suppress(TypeError):
         _known[function] = out
     return out
@@ -202,17 +222,7 @@ def _parameters(function: Callable) -> list[Parameter] | None:
 
 def takes(function: Callable) -> tuple[str, ...] | None:
     """Return the names among t, X and x that a function takes as arguments, or None if it has other parameters."""
-    return _names(function, _parameters(function))
-
-
-def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
-    """Return the result of `takes` for a function with the given parameters."""
-    if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
-        return ("t",)
-    names = tuple([p.name for p in parameters])
-    if not names or not set(names) <= set(NAMES):
-        return None
-    return None if names == ("x",) and not _plain(function) else names
+    return _arguments(function).names
 
 
 def by_place(value) -> bool:
@@ -231,7 +241,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
     names = takes(function)
     if names is not None and set(names) <= set(among):
         return names
-    given = ", ".join(p.name for p in _parameters(function) or ())
+    given = ", ".join(_arguments(function).parameters)
     if given == "x" and "x" in among:  # such as an interpolation in time
         raise ValueError(f"{what}: an object, or a function of x in a library, must be lambda t: ..., or lambda x: ...")
     allowed = "must be a function of the time alone"
@@ -242,13 +252,8 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
 
 def called(function: Callable, values: dict) -> object:
     """Call a function, and return its result.  `values` contains arguments by name: t, X or x."""
-    parameters = _parameters(function)
-    if parameters is None:
-        return function(values["t"])
-    by_name = {p.name: values[name] for p, name in zip(parameters, _names(function, parameters), strict=True)}
-    alone = {p.name for p in parameters if p.kind == p.KEYWORD_ONLY}
-    positional = [value for name, value in by_name.items() if name not in alone]
-    return function(*positional, **{name: by_name[name] for name in alone})
+    _, _, alone, positional = _arguments(function)
+    return function(*map(values.get, positional), **dict(zip(alone, map(values.get, alone.values()), strict=True)))
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
@@ -259,8 +264,8 @@ def at_places(what: str, allowed: str, function: Callable, name: str, places: ND
     ValueError
         The function has other parameters, or raises an exception.
     """
-    names = [p.name for p in _parameters(function) or ()]
-    if _plain(function) and names != [name]:
+    names = _arguments(function).parameters
+    if _plain(function) and names != (name,):
         kind = {"X": "reference positions", "x": "positions as seeded"}[name]
         raise ValueError(f"{what}: a function of ({', '.join(names)}), must be a function of {name}, the {kind}")
     return asked(what, allowed, function, places)

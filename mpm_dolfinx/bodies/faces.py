@@ -152,9 +152,7 @@ def surface(
         allowed = f"must be one of {', '.join(known)}" if known else "no body has a named side"
         raise ValueError(f"side {name!r}: {allowed}")
     box = limits(region, dim)
-    around = [
-        Faces.around(body) if visible and sum(shown) > 1 else None for body, visible in zip(bodies, shown, strict=True)
-    ]
+    around = [Faces.around(body) if seen and sum(shown) > 1 else None for body, seen in zip(bodies, shown, strict=True)]
     none = np.empty(0, np.int64)
     start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):

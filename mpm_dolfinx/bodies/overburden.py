@@ -47,9 +47,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
     ray, domain = near["i"], near["j"]
     inside = ((across[ray] >= low[domain]) & (across[ray] <= high[domain])).all(axis=1)
     ray, domain = ray[inside], domain[inside]
-    hits = [
-        (ray[on], height, sign * unit_weight[domain[on]]) for on, height, sign in _hits(corners[domain], across[ray])
-    ]
+    hits = [(ray[on], z, sign * unit_weight[domain[on]]) for on, z, sign in _hits(corners[domain], across[ray])]
     ray, height, weight = (np.concatenate(column) for column in zip(*hits, strict=True))
     surface = np.full(len(across), -np.inf)
     np.maximum.at(surface, ray, height)

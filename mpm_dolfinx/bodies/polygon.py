@@ -180,9 +180,7 @@ def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: fl
         tags, x, _ = gmsh.model.mesh.getNodes()
         number = np.zeros(int(max(tags, default=0)) + 1, dtype=np.int64)
         number[tags] = np.arange(len(tags))
-        triangles, squares = (
-            number[gmsh.model.mesh.getElementsByType(kind)[1]].reshape(-1, kind + 1) for kind in (2, 3)
-        )
+        triangles, squares = (number[gmsh.model.mesh.getElementsByType(k)[1]].reshape(-1, k + 1) for k in (2, 3))
         cells = {"triangle": triangles, "quad": squares[:, AS_LATTICE["quad"]]}
         sides = {
             name: [number[gmsh.model.mesh.getElementsByType(1, tag)[1]].reshape(-1, 2) for tag in lines]

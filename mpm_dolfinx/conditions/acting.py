@@ -145,8 +145,6 @@ class Loads:
     """Whether the tangent is independent of the displacement."""
     smooth: bool = True
     """Whether the tangent of a substep may be reused in the next substep."""
-    varies: bool = False
-    """Whether `loads` and `resists` depend on the displacement."""
     stiff: bool = False
     """Whether `penalty` adds a matrix."""
     holding: bool = False
@@ -313,6 +311,16 @@ class Loads:
 
         `before`: points at the start of the step.
         """
+
+
+def defined(loads: Sequence[Loads], *names: str) -> dict[str, list[Callable]]:
+    """Return by name the methods that loads define.  Methods of the class `Loads` add nothing, and are left out."""
+    found = {name: [] for name in names}
+    for one in loads:
+        for name, methods in found.items():
+            if getattr(type(one), name) is not getattr(Loads, name):
+                methods.append(getattr(one, name))
+    return found
 
 
 class Acting:

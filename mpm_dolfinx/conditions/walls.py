@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
+from mpm_dolfinx.grid.grid import SIDES, Grid
 
 
 def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
@@ -64,26 +64,18 @@ def stopped(
     return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
 
 
-def wall_forces(
-    grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
-) -> dict[str, NDArray[np.float64]]:
-    """Return the force (d,), in N, of each wall by name.  All processes must call this function.
+def wall_shares(grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the share (2 d, n) of each wall in the forces on degrees of freedom.
 
     If several walls fix a component of a node, the wall normal to this component gets the force.  If none of them is
     normal to the component, all get equal shares.
 
     `dofs` (n,): flat local degrees of freedom, possibly repeated.
-    `forces` (n,), in N: forces on these degrees of freedom.
     """
-    d, sides = grid.dim, SIDES[grid.dim]
-    node, component = np.divmod(dofs, d)
+    sides, (node, component) = SIDES[grid.dim], np.divmod(dofs, grid.dim)
     place, fixed = grid.nodes_along(grid.node_x[node]), [a in walls.get(name, "") for name in sides for a in "xyz"]
     across = np.array([component == axis for axis, _ in sides.values()])
     holds = np.array([place[:, axis] == end * grid.shape[axis] for axis, end in sides.values()])
     holds &= np.array(fixed).reshape(-1, 3)[:, component]
     holds = np.where((holds & across).any(axis=0), holds & across, holds)
-    shares = holds / np.maximum(1, holds.sum(axis=0)) * forces
-    out = grid.comm.allreduce(sum_by(component, shares, d))
-    if grid.has_axis:
-        out[0, 0] = 0.0
-    return dict(zip(sides, out, strict=True))
+    return holds / np.maximum(1, holds.sum(axis=0))

@@ -185,9 +185,7 @@ class Contacts(Touching):
         """Return the quadrature points on the faces, of all processes."""
         patches, d = cut.contact_surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.face]]
-        now, then = (
-            np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
-        )
+        now, then = (np.take_along_axis(p.corners[patches.at], index[:, :, None], axis=1) for p in (points, cut.points))
         stiffness = self._stiffness(cut.points)[patches.at]
         area = patches.area(points)
         n = len(now)

@@ -73,14 +73,14 @@ def _second_differences(
     for a in range(d):
         low, high = order[bits[:, a] == 0], order[bits[:, a] == 1]
         first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])
-        along = last - first
+        along, h = last - first, grid.along(cells, a)
         ends = []
         known = []
         for k, (end, value) in enumerate(((low, first), (high, last))):
             local = neighbours[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
             known.append((local >= 0) & filled[local])
-            h, g = grid.along(cells, a), grid.along(local, a)  # h^2 times the second derivative of a parabola
+            g = grid.along(local, a)  # below: h^2 times the second derivative of a parabola
             ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
         first, last = np.where(known[0], *ends), np.where(known[1], *ends[::-1])
         smaller = np.where(np.abs(first) < np.abs(last), first, last)

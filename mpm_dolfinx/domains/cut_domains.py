@@ -149,20 +149,25 @@ class CutDomains(Keyed):
         faces, self._faces = self._faces, None
         return faces
 
-    def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+    def crossed(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the distances (n, 2^d, d) of corners from their positions at the cut, in cell sizes."""
+        return self.grid.cells_between(self.points.corners, points.corners)
+
+    def moved(self, crossed: NDArray[np.float64], part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return the largest motion of corners since the cut, in cell sizes, for each connected part (count,).
 
+        `crossed`: result of `crossed`.
         `part` (n,): index of the connected part of each point.
         """
-        far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
+        far = np.maximum.reduce(crossed, axis=(1, 2))
         largest = np.zeros(count) if count > 1 else far.max(initial=0.0, keepdims=True)
         if count > 1:
             np.maximum.at(largest, part, far)
         return over_all(self.grid.comm, largest, MPI.MAX)
 
-    def valid(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-        """Return whether the cut is still valid for each connected part (count,)."""
-        return self.moved(points, part, count) <= STILL
+    def valid(self, crossed: NDArray[np.float64], part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return whether the cut is still valid for each connected part (count,).  Parameters: see `moved`."""
+        return self.moved(crossed, part, count) <= STILL
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values (n, ...) of points to the owners of cells.  Return values (m, ...) of pieces in owned cells."""
@@ -214,9 +219,10 @@ class CutDomains(Keyed):
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
         """Return the quadrature points of several surfaces."""
-        if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
+        if not self._patches.keys() >= set(several):
+            new = [faces for faces in dict.fromkeys(several) if faces not in self._patches]
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
-        return [self._patches[faces] for faces in several]
+        return list(map(self._patches.__getitem__, several))
 
     def _cut_surfaces(self, several: Sequence[Surface], least: float = 0.0) -> list[Patches]:
         origin = None

@@ -191,9 +191,9 @@ def _slopes(
     faces = [np.add.reduce(corners[at]) / 2 ** (d - 1) for at in FACES[d]]
     edges = np.array([faces[2 * a + 1] - faces[2 * a] for a in range(d)]).swapaxes(0, 1)
     inverse = _inverse(edges)
-    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.sum(axis=0) / 2**d, soils[rows].T])
+    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, np.add.reduce(corners) / 2**d, soils[rows].T])
     others = neighbours.at_neighbours(own, faces)
-    nearest = NEAR * np.abs(edges).sum(axis=0).min(axis=0)
+    nearest = NEAR * np.minimum.reduce(np.add.reduce(np.abs(edges)))
     A, B = np.zeros((d, d, len(rows))), np.zeros((d, k * k, len(rows)))
     for axis in range(d):
         some = np.zeros(len(rows), dtype=bool)

@@ -155,7 +155,7 @@ def _at_sites(
     value differs from the mean by more than `tolerance`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
-    layer = number // across
+    layer = number // across if comm.size > 1 else number[:0]
     rank = starts.searchsorted(layer, side="right") - 1
     exchange = Exchange(comm, rank)
     rows = [(exchange.send(number), exchange.send(values))]
@@ -264,22 +264,16 @@ def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray
 
 
 def filtered(
-    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
+    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, crossed: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the change of the corners (n, 2^d, d), in m, by the filter.
 
-    `then`: points at the last grid reset.
-    `free` (n,): whether points are filtered.
+    `crossed` (n, 2^d): numbers of cells that corners have crossed since the grid reset; 0 for points without filter.
     """
-    out, cells = np.zeros(points.corners.shape), crossed(grid, points, then, free)
+    out = np.zeros(points.corners.shape)
     for lattice in lattices:
         rows = lattice.rows(points)
         moved = points.corners[rows] - points.reference[rows]
         parts = lattice.corners_of_parts(points) if ROOT in points.data else ()
-        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, cells[rows], parts)
+        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, crossed[rows], parts)
     return out
-
-
-def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the numbers (n, 2^d) of cells that corners have crossed since the reset; 0 if not `free`."""
-    return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

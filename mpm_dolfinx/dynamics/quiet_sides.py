@@ -114,8 +114,6 @@ class QuietSides(Acting):
 class QuietLoads(Loads):
     """Loads of the quiet sides in a substep."""
 
-    varies = True
-
     def __init__(self, forms: QuietForms, data: PointData):
         self._forms, self._data = forms, data
 

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
@@ -82,7 +82,7 @@ class Borders:
         paths, slots = flow.mobility.paths, 1
         if paths is not None:
             slots = paths.law.shape[-1]
-            plain = replace(flow, mobility=Mobility(np.ones(len(contents.filled))))
+            plain = flow._replace(mobility=Mobility(np.ones(len(contents.filled))))
             mixed_slots = contents.slot(np.flatnonzero(self.mixed >= 0))
             paths = paths.eased(plain.along(d)[mixed_slots])
         slots = grid.comm.allreduce(slots, MPI.MAX)
@@ -100,9 +100,7 @@ class Borders:
         h = np.broadcast_to(h, (2 * len(axis), d)).reshape(2, len(axis), d)
         rows, unit = np.arange(len(axis)), np.eye(d)[axis]
         across = h[:, rows, axis]
-        lengths = [
-            across[i] / 2 - sign * places[cells, axis] for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
-        ]
+        lengths = [across[i] / 2 - sign * places[of, axis] for i, (of, sign) in enumerate(((first, 1), (other, -1)))]
         lengths = [np.maximum(length, EPSILON * edge) for length, edge in zip(lengths, across, strict=True)]
         shift = moved + places - contents.centroid
         drift = (shift[other] - shift[first]) / 2  # the face moves by the mean displacement of both cells

@@ -198,17 +198,15 @@ class RainedFaces(OpenFaces):
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow (m,) through each face, in m^d/s."""
         ponded = self.pond.outflow(fluid)
-        return np.where(
-            np.isnan(self.rain), ponded, np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
-        )
+        rained = np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
+        return np.where(np.isnan(self.rain), ponded, rained)
 
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction.  Faces with rain have no correction."""
-        return tuple(
-            np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
-        )
+        dry = np.isnan(self.rain)
+        return tuple(np.where(dry, values, 0.0) for values in self.pond.nonorthogonal(fluid, difference))
 
     def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative (m, d) of `driven` with respect to the inertia force, or zero for faces with rain."""
@@ -234,14 +232,13 @@ class SideFeeds(Feeds):
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
-        self._rains = [depth is not None for depth in ponds]
         self._names, self._before = names, wet.outcome
         self._at, self._comm = wet.contents.slot(sides.cells), wet.cut.grid.comm
-        self._fallen = sides.rain
+        self._ponds, self._fallen = ponds, sides.rain
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
-        self.settles = bool(self._seeps.any())
-        self.linear = not any(self._rains)
+        self.settles = bool(np.logical_or.reduce(self._seeps))
+        self.linear = ponds.count(None) == len(ponds)
         self._drain = wet.drains
         self._flows, self._nonorthogonal = True, 0.0
         self._share: NDArray[np.float64] | float = 0.0
@@ -265,25 +262,19 @@ class SideFeeds(Feeds):
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
-    def conducting(self, flow: Conduction) -> OpenFaces:
-        """Return the faces with their conductances."""
-        faces = self._faces(self.sides, flow)
-        if not any(self._rains):
-            return faces
-        driest = np.where(np.isnan(self.sides.driest), self.sides.pressure, self.sides.driest)
-        dry = self._faces(replace(self.sides, pressure=driest), flow)
-        same = (faces.at, faces.conductance, faces.inflow, faces.seeps, faces.offset)
-        return RainedFaces(*same, self.sides.rain, faces, dry)
-
-    def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
-        """Return the faces with their conductances for the outside pressures in `sides`."""
-        at = self._at
+    def conducting(self, flow: Conduction, driest: NDArray[np.float64] | None = None) -> OpenFaces:
+        """Return the faces with their conductances.  `driest` (m,), Pa: pressure outside in place of the pond's."""
+        at, sides = self._at, self.sides if driest is None else replace(self.sides, pressure=driest)
         (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
-        if flow.relative is None:
-            return OpenFaces(at, conductance, inflow, self._seeps, offset)
-        drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight
-        rest = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, drop
-        return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
+        faces = OpenFaces(at, conductance, inflow, self._seeps, offset)
+        if flow.relative is not None:
+            drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight
+            rest = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, drop
+            faces = UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
+        if self.linear or driest is not None:
+            return faces
+        dry = self.conducting(flow, np.where(np.isnan(sides.driest), sides.pressure, sides.driest))
+        return RainedFaces(at, conductance, faces.inflow, self._seeps, offset, sides.rain, faces, dry)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """See `Feeds`.  Seepage faces with an outflow are opened."""
@@ -320,17 +311,17 @@ class SideFeeds(Feeds):
         Run-off is rain that neither infiltrates nor fills a pond.
         """
         rows = through = self._through(at, fluid)
-        if any(self._rains):  # nan without rain
+        if not self.linear:  # nan without rain
             excess = np.maximum(self._fallen, 0.0) + np.minimum(through, 0.0)
             rows = np.stack([through, self._fallen, excess])
         sums = over_all(self._comm, sum_by(self.sides.number, rows, len(self._names)))
-        if not any(self._rains):
+        if self.linear:
             return {"outflows": dict(zip(self._names, sums, strict=True))}
         out, rain, runs = sums
         runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # < 0 if a pond supplies the soil
         found = {"outflows": dict(zip(self._names, out, strict=True)), "rain": {}, "runoff": {}}
-        for name, rains, *of in zip(self._names, self._rains, rain, runs, strict=True):
-            if rains:
+        for name, pond, *of in zip(self._names, self._ponds, rain, runs, strict=True):
+            if pond is not None:
                 found["rain"][name], found["runoff"][name] = of
         return found
 
@@ -338,11 +329,11 @@ class SideFeeds(Feeds):
         self, now: Mapping[str, Mapping[str, NDArray[np.float64]]]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the ponded water, and the total of run-off and seepage from sides with rain, in m^d."""
-        if not any(self._rains):
+        if self.linear:
             return {}
         out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "ran_off": {}}
-        for name, rains, most in zip(self._names, self._rains, self._most, strict=True):
-            if rains:
+        for name, pond, most in zip(self._names, self._ponds, self._most, strict=True):
+            if pond is not None:
                 free = now["rained"][name] + now["flowed"][name]  # rain that did not infiltrate
                 out["ponded"][name] = np.clip(free - self._before["ran_off"][name], 0.0, most)
                 out["ran_off"][name] = free - out["ponded"][name]

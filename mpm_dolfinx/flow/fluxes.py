@@ -68,8 +68,7 @@ class CellMotion(NamedTuple):
     hoop: NDArray[np.float64] | None  # circumferential stretch (n,); None unless axisymmetric
 
 
-@dataclass(frozen=True)
-class Conduction:
+class Conduction(NamedTuple):
     """Conductivity and motion of the filled owned cells."""
 
     mobility: Mobility
@@ -185,16 +184,10 @@ class OpenSides:
         cosine = normal[:, :, None] * [-1, 1]
         row, axis, end = (cosine > ALONG).nonzero()
         share = area[row] * cosine[row, axis, end]
-        slots = (at[row] * out.shape[1] + axis) * 2 + end
-
-        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return sums of the values over the faces at each end of each cell, along each axis."""
-            return sum_by(slots, values, out[..., 0].size).reshape(out.shape[:3])
-
-        whole = total(share)
         # the pressure is constant along the side, so the pressure gradient is normal to the side
-        for k, values in enumerate((jump[row], (jump / distance)[row] * normal[row, axis])):
-            np.divide(total(share * values), whole, out=out[..., k], where=whole > 0)
+        values = share * [jump[row], (jump / distance)[row] * normal[row, axis]]
+        whole, *sums = sum_by((at[row] * out.shape[1] + axis) * 2 + end, np.array([share, *values]), out[..., 0].size)
+        out.reshape(-1, 2)[whole > 0] = np.transpose(sums)[whole > 0] / whole[whole > 0, None]
         return out
 
 
@@ -222,26 +215,27 @@ class CellContents(Keyed):
         self.grid = grid = forms.grid
         self.active = active = forms.active.now.cells
         """Owned active cells and active ghost cells."""
-        self.filled, self._nodes = filled, grid.cell_nodes[filled]
+        self.filled, self.nodes = filled, grid.cell_nodes[filled]
+        """Filled owned cells (n,), and their nodes (n, 2^d)."""
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
         """`weight` (m,): volumes of pieces, m^d.  `area` (m,): `weight`, or in axisymmetry areas of sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
-        rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
-        sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
-        self.volume, area, self.fixed_stress = sums[:3]
+        rows = [self.weight, self.area, *(self.weight * [pieces.fixed_stress, pieces.damping])]
+        rows = [rows, (self.area[:, None] * pieces.x).T, pieces.faces.reshape(len(self.area), 2 * d).T]
+        self.volume, area, self.fixed_stress, damping, *sums = self.total(np.concatenate(rows))
         """`volume` (n,): material in filled cells, m^d.  `fixed_stress` (n,): integral of beta in each cell, m^d/Pa."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
-        self._damped, self._damping = forms.damping, pieces.damping
+        self._damped, self._damping = forms.damping.x, damping / self.volume
         forms.fixed_stress.x.array[filled] = self.fixed_stress
         centroid, lower, upper = (f.x.array.reshape(-1, d) for f in shapes)
-        centroid[filled] = (sums[3 : 3 + d] / area).T - grid.midpoints[filled]
+        centroid[filled] = (sums[:d] / area).T - grid.midpoints[filled]
         rounding = np.reshape(ROUND_OFF * grid.around(grid.midpoints[filled]), (-1, 1))
-        for target, faces in ((lower, sums[3 + d :: 2]), (upper, sums[4 + d :: 2])):
-            share = faces.T * grid.sizes(filled) / np.array(grid.volumes(filled)).reshape(-1, 1)
+        for target, faces in ((lower, sums[d::2]), (upper, sums[d + 1 :: 2])):
+            share = np.transpose(faces) * grid.sizes(filled) / np.array(grid.volumes(filled)).reshape(-1, 1)
             target[filled] = np.where(share > rounding, share, 0.0)  # rounding errors open no face
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
@@ -272,27 +266,23 @@ class CellContents(Keyed):
         `share` (n,): factor.
         `less` (n,), 1/Pa: storage due to changes of saturation.
         """
-        tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
-        tau.array[self.filled] = values
-        tau.scatter_forward()
+        values = np.maximum(share * self._damping - less, 0.0)
+        self._damped.array[self.filled] = values
+        self._damped.scatter_forward()
         return values
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the volume-weighted mean (n,) of the values (m,) of the pieces in each filled cell."""
         return self.total(self.weight * values) / self.volume
 
-    def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (n, d, 2^d) of u (nodes, d) at the nodes of each filled cell."""
-        return u[self._nodes].transpose(0, 2, 1)
-
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
         """Return the motion of filled cells, at the centroids of their material.
 
-        `nodal`: displacements, in m.
+        `nodal` (n, 2^d, d), in m: displacements of the nodes of each cell.
         `rests`: indices of filled cells that do not move.
         """
         hoop, d = None, self.grid.dim
-        at_centroids = nodal @ self._shapes
+        at_centroids = nodal.transpose(0, 2, 1) @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
@@ -477,10 +467,8 @@ class FluxForms:
         along = off - ufl.dot(off, n0) * n0
         self.nonorthogonal = None
         if flows and not grid.axisymmetric:
-            conductance = T * ufl.avg(self.density)
-            self.nonorthogonal = FacetForm(
-                -conductance * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm
-            )
+            flow = T * ufl.avg(self.density) * ufl.dot(ufl.avg(self.slope), along)
+            self.nonorthogonal = FacetForm(-flow * ufl.jump(q) * dS, grid.comm)
         self.gravity = self.by_motion = None
         if (weight is not None or relative is not None) and flows:
             # still water must not flow: its pressure increases with depth by the unit weight at zero pressure.
@@ -497,9 +485,8 @@ class FluxForms:
 
                 def by_k(k):
                     """Return the derivative of the transmissibility T with respect to k, one of the values of k_r."""
-                    return share * (
-                        d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
-                    )
+                    first = d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k)
+                    return share * (first + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k))
 
                 # the outflow must rise with the pressure of the cell, and fall with the neighbour's, despite rounding
                 own, other = (

@@ -35,7 +35,6 @@ would be too slow.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from petsc4py import PETSc
@@ -190,8 +189,7 @@ class StorageForms:
         return sum_ghosts(self._work)
 
 
-@dataclass(frozen=True)
-class Outflow:
+class Outflow(NamedTuple):
     """Conductances of the n active owned cells at the current displacements."""
 
     at: Sequence[Any]  # data of the conditions on the fluid, see `Feeds.conducting`
@@ -200,8 +198,7 @@ class Outflow:
     nonorthogonal: NonorthogonalFlow | None  # non-orthogonal correction
 
 
-@dataclass(frozen=True)
-class Rates:
+class Rates(NamedTuple):
     """Outflow rates of the owned cells, in m^d/s.  The result of `integrated` contains outflow volumes, in m^d."""
 
     cells: NDArray[np.float64]  # outflow of each cell minus its sources
@@ -241,17 +238,18 @@ class StorageSystem:
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), (grid.midpoints, grid.near_others[1]))
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
         """Connected part of the bodies that contains each unknown."""
-        self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
+        self.L = matrix(own, own, 2 * d + 1)
         self.moves = moves = fluxes.by_motion is not None
         """Whether the matrix B contains the derivative of the outflow due to inertia, see `set_by_motion`."""
         self.B_momentum = matrix(own, momentum, 2**d * d)
         self.B = matrix(own, momentum, d * (d * moves + 1) * 2**d) if moves or not forms.symmetric else self.B_momentum
-        self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
+        self.residual, self.step, self._potentials, self._outflow = (own.vector() for _ in range(4))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
         self._uniform = self._over_uniform() if fluxes.relative is None else None
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # has entries even for a cell without faces
+        self.T, self.D = self.L.duplicate(), self.L.duplicate()
         pattern = self.L
         if forms.softens:
             zeros = np.zeros((grid.num_local, d, 2))
@@ -291,7 +289,8 @@ class StorageSystem:
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the outflow to other cells due to the mass potentials pi, in m^d/s."""
         self._potentials.array_w[:] = pi
-        return (self.T * self._potentials).array_r
+        self.T.mult(self._potentials, self._outflow)
+        return self._outflow.array_r
 
     def set_alternation(self) -> None:
         """Assemble the matrix L of `StorageProblem.assemble_preconditioner`."""
@@ -312,9 +311,9 @@ class StorageSystem:
         if (relative := self._forms.fluxes.relative) is not None:
             p = self._forms.p.x.array[contents.filled]
             mobility = mobility * relative.at(contents.filled, p)[:, None]
-            flow = replace(flow, relative=relative)
+            flow = flow._replace(relative=relative)
         self.assemble_fluxes()
-        total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # entries even for cells without faces
+        total = self.T.getDiagonal(self._outflow).array_r.copy()
         nonorthogonal = None
         if off is not None:
             facets, gradients, sides = off
@@ -340,7 +339,7 @@ class StorageSystem:
 
         `force`: see `StorageForms.driven`.
         """
-        zero(self.T)
+        self.T.zeroEntries()
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
             borders = relative.set_pressures(self._forms.p.x.array, force)
@@ -351,8 +350,7 @@ class StorageSystem:
         self.T.assemble()
 
 
-@dataclass(frozen=True)
-class StorageResidual:
+class StorageResidual(NamedTuple):
     """Residuals of the fluid balance in the cells, and sums (parts,) over the cells of each connected part, in m^d."""
 
     vector: PETSc.Vec
@@ -432,7 +430,7 @@ class StorageProblem:
         """Non-orthogonal correction (m^d/s) of the fluxes, constant in the substep."""
         if self.damped:
             forms.fluxes.dt.value = dt
-            zero(system.D)
+            system.D.zeroEntries()
             system.damp.assemble_matrix(system.D)
             system.D.assemble()
 
@@ -560,7 +558,7 @@ class StorageProblem:
             if not 0 < largest < np.inf:
                 return np.zeros(len(base))
             step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array[dofs]
-            unknowns.add(u, step, v)
+            unknowns.add(u.x, step, v)
             moved = self._rates(self._flow(False)).cells
             u.x.array[dofs] = now
             return self.dt * (moved - base) / step / density
@@ -695,9 +693,8 @@ class StorageProblem:
         return system.P
 
 
-def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Add values to the diagonal of a matrix, and return the new diagonal."""
+def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> None:
+    """Add values to the diagonal of a matrix."""
     d = A.getDiagonal()
     d.array_w[:] += values
     A.setDiagonal(d)
-    return d.array_r.copy()

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.forms.axes import block
-from mpm_dolfinx.grid.grid import Grid, in_chunks
+from mpm_dolfinx.grid.grid import Grid, distinct, in_chunks, sum_by
 
 BATCH, MANY = 2**10, 2**12
 """`BATCH`: number of points in a batch of element matrices, which fits into the processor's cache.  `MANY`: number of
@@ -204,7 +204,7 @@ class Places(Keyed):
         if grid.axisymmetric and hoop is None:
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
         self.hoop = hoop
-        self.filled, self.slots = np.unique(cells, return_inverse=True)
+        self.filled, self.slots = distinct(cells, grid.num_local)
         """`filled`: cells that contain points.  `slots` (n,): index of each point's cell in `filled`."""
 
     @cached_property
@@ -217,8 +217,12 @@ class Places(Keyed):
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Dofs (n,) of Q1 vectors in all cells with points, and indices in this array of the dofs of each cell."""
         d = self.grid.dim
-        nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
+        nodes, at = distinct(self.grid.cell_nodes[self.filled], len(self.grid.node_x))
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
+
+    def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (..., cells) of values (..., n) over the points of each cell in `filled`."""
+        return sum_by(self.slots, values, len(self.filled))
 
     def part(self, rows: NDArray[np.int64]) -> Places:
         """Return the positions of the points with the indices `rows`."""
@@ -416,21 +420,20 @@ class PointForm:
         self._dense, self.compiled = dense, _compat.CompiledForm(form)
         self._rows, self._bound = Rows(self.compiled, points), Latest()
 
-    def _parts(self, data: PointData) -> list[tuple]:
+    def _parts(self, cells: NDArray[np.int64]) -> list[tuple]:
         """Return slices of the points, each with dolfinx's form over the cells of these points."""
-        cells, bind = data.places.slots if self._dense else data.cells, self.compiled.bind
-        return self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))])
+        return [(rows, self.compiled.bind(cells[rows])) for rows in in_chunks(len(cells))]
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
         """Add the assembled vector to the local array `b`, ghost entries included."""
-        live = self._rows.live(data, given)
-        for part, form in self._parts(data):
+        live, cells = self._rows.live(data, given), data.places.slots if self._dense else data.cells
+        for part, form in self._bound(cells, partial(self._parts, cells)):
             self.compiled.assemble_vector(b, self._rows(data, part, live), form)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix, in unrolled local dofs, to `A`.  The caller must assemble `A`."""
         live = self._rows.live(data, NONE)
-        for part, form in self._parts(data):
+        for part, form in self._bound(data.cells, partial(self._parts, data.cells)):
             self.compiled.assemble_matrix(A, self._rows(data, part, live), form)
 
 

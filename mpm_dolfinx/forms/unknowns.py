@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 import numpy as np
 import scipy.sparse
-from dolfinx import fem
+from dolfinx import fem, la
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
@@ -87,11 +87,10 @@ class Unknowns:
         out.array_w[:] = values[self.owned]
         return out
 
-    def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
-        """Add scale * v to a function, with a vector v of unknowns, and update the function's ghosts."""
-        values = function.x
-        values.array[self.owned] += scale * v.array_r
-        values.scatter_forward()
+    def add(self, x: la.Vector, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
+        """Add scale * v to the vector x of a function, with a vector v of unknowns, and update the ghosts of x."""
+        x.array[self.owned] += scale * v.array_r
+        x.scatter_forward()
 
 
 def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:

@@ -34,5 +34,5 @@ class Velocity:
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
         """Set `own`, in s.  Set the field `past` to the present u, multiplied by the argument `past`."""
-        self._own.value = own
+        self._own.value.fill(own)
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

@@ -89,12 +89,13 @@ def in_chunks(count: int) -> list[slice]:
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the sums (..., size) of all values (..., n) with equal index (n,), as floats."""
-    shape = values.shape[:-1]
-    if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
+    if values.ndim == 1:
+        return np.bincount(index, values, size).astype(float, copy=False)
+    if len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
         return np.array([sum_by(index, row, size) for row in values])
-    if shape:
-        index = (index + size * np.arange(prod(shape))[:, None]).ravel()
-    sums = np.bincount(index, weights=values.ravel(), minlength=size * prod(shape))
+    shape = values.shape[:-1]
+    index = (index + size * np.arange(prod(shape))[:, None]).ravel()
+    sums = np.bincount(index, values.ravel(), size * prod(shape))
     return sums.astype(float, copy=False).reshape(*shape, size)
 
 
@@ -152,6 +153,18 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
+
+
+def distinct(numbers: NDArray[np.integer], count: int) -> tuple[NDArray[np.integer], NDArray[np.intp]]:
+    """Return the distinct numbers (k,), ascending, and the index (n,) of each of the n numbers among them.
+
+    `count`: number above all `numbers`, which are at least 0.
+    """
+    if count > numbers.size:
+        return np.unique(numbers.ravel(), return_inverse=True)
+    found = np.zeros(count, dtype=bool)
+    found[numbers] = True
+    return found.nonzero()[0].astype(numbers.dtype), (found.cumsum() - 1)[numbers.ravel()]
 
 
 def values_at(

@@ -107,7 +107,7 @@ def save(simulation: Simulation, file: Path) -> None:
         arrays |= _nodal_rows(simulation, name, getattr(state, name))
     rows = {name: arrays.pop(name) for name in list(arrays) if _numbered(name)}
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
-    note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
+    note |= {"scene": describe(simulation), "result": _fields(state.result, but="rows"), "control": vars(state.control)}
     note["partition"] = simulation.grid.partition.boxes.tolist()
     arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **arrays}
     with on_disk(f"{file}: checkpoint at t = {state.t:g} s", WRITABLE):
@@ -159,13 +159,13 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     return simulation.result
 
 
-def _scalars(result: Result) -> dict[str, Any]:
-    return {f.name: getattr(result, f.name) for f in fields(result) if f.name != "rows"}
+def _fields(of: Any, but: str = "") -> dict[str, Any]:
+    return {f.name: getattr(of, f.name) for f in fields(of) if f.name != but}
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return all arrays of a state, by their names in the file."""
-    named = {"points": vars(state.points), "outcome": state.outcome}
+    named = {"points": _fields(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
         for name, value in _named("", outcome).items():
@@ -179,7 +179,7 @@ def _arrays(state: State) -> dict[str, NDArray]:
     if state.trend is not None:
         named["trend"] = vars(state.trend)
     if state.stay is not None:
-        named["stay"] = {"points": vars(state.stay.points)}
+        named["stay"] = {"points": _fields(state.stay.points)}
         if state.stay.keeps is not None:
             named["stay"]["keeps"] = state.stay.keeps
     return _named("", named)

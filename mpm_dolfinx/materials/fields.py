@@ -118,9 +118,8 @@ class SceneMaterials:
         moduli = [m.oedometric for m in evaluated], [m.shear for m in evaluated]
         self.varied = any(most > 2 * least for least, most in (_ends(grid, of) for of in moduli))
         """Whether stiffness differs between points by more than a factor of two."""
-        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated) or any(
-            callable(m.conductivity) for m in used
-        )
+        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
+        self.conducts |= any(callable(m.conductivity) for m in used)
         """Whether fluid flows in the scene, or may flow in a later stage."""
         least, most = _ends(grid, [m.conductivity for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
@@ -324,7 +323,8 @@ class SceneMaterials:
         """
         each, shapes = [], set()
         for i in self._used:
-            rows = (points.material == i).nonzero()[0] if len(self._used) > 1 else np.arange(len(points.id))
+            alone = slice(None) if not self._fields[i] else np.arange(len(points.id))
+            rows = (points.material == i).nonzero()[0] if len(self._used) > 1 else alone
             at = self._at(points, i, rows) if self._fields[i] else self.materials[i]
             found = np.asarray(value(at, *[column[rows] for column in columns]) if columns else value(at))
             each.append((rows, found))

@@ -329,7 +329,7 @@ class Mass:
         """Return a vector of the unknowns as a local array with zeros at fixed displacements."""
         work = self._forms.work
         work.x.array[:] = 0.0
-        self.unknowns.add(work, 1.0, v)
+        self.unknowns.add(work.x, 1.0, v)
         return work.x.array.copy()
 
     @cached_property

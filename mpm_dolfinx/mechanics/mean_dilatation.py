@@ -34,7 +34,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.forms.axes import block, embedded
 from mpm_dolfinx.forms.cell_matrices import Beside, insert
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Given, PointData, PointExpression
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -188,7 +188,7 @@ class MeanDilatation:
             given, sums = [*solve()], []
             for number, part, of in zip(self.numbers, self._parts(data), self._sums, strict=True):
                 values = of.stress.evaluate(part, live=of.stress.live(part, given[number]))
-                sums.append(sum_by(part.places.slots, part.volume * values[:, -1], len(part.places.filled))[:, None])
+                sums.append(part.places.total(part.volume * values[:, -1])[:, None])
                 given[number] = {**given[number], STRESS: values[:, :-1]}
             self._set_mean(self.pi, sums, data)
             return given
@@ -254,7 +254,7 @@ class MeanDilatation:
         key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
-            sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
+            sums = [p.places.total(p.volume)[:, None] for p in self._parts(data)]
             return self._cells(data).total(sums)
 
         return self._volume(key, volumes)

@@ -15,7 +15,7 @@ start of the step.  A law may define the stress instead of psi.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 from petsc4py import PETSc
@@ -26,13 +26,14 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
-from mpm_dolfinx.conditions.walls import wall_forces
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.conditions.acting import At, FormsOf, Loads, defined
+from mpm_dolfinx.conditions.walls import wall_shares
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import NONE, CellSums, FormPoints, Given
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
-from mpm_dolfinx.grid.grid import among, sum_by
+from mpm_dolfinx.grid.grid import SIDES, among, sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -46,6 +47,9 @@ from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.active import Active, ActiveSet
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
+
+Adds = Callable[[NDArray[np.float64]], None]
+"""Function that adds local nodal forces, in N, to an array."""
 
 
 class FormsOfPart(NamedTuple):
@@ -104,14 +108,16 @@ class MomentumForms:
         self._suction = pressure if dried else None
         sums = [part.dried for part in self.law_forms]
         self._of_suction = OfSuction(grid.dim, self.dilatation, sums) if dried else None
+        self.wall_shares: Latest[NDArray[np.float64]] = Latest()
+        """The last result of `wall_shares`."""
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """Forms of the scene's conditions."""
         self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
         full = None if retentions is None else retentions.of("saturation", pressure, pieces)
         wet = materials.fluid and materials.fluid.density
-        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, wet, full)
-        self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
+        weight = [] if gravity is None else [Weight(pieces, self.u, gravity, wet, full)]
+        self.acting = [*weight, *[self.own] * bool(terms)]
         """Weight and user-defined terms, which act in all stages."""
         self.symmetric = symmetric and self.own.symmetric
         self.linear = not locked and all(law.linear for law, *_ in laws)
@@ -187,7 +193,7 @@ class MomentumForms:
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
         return self.active.now
 
-    def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
+    def summed(self, room: int, adders: Sequence[Adds]) -> NDArray[np.float64]:
         """Return the nodal forces of `adders`, summed over processes.  `room`: index of the buffer for the result."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
@@ -200,16 +206,12 @@ class MomentumForms:
         """Displacement increment u as an array (nodes, d), in m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
-    def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses, and of fluid that flows into dilating pores, in N."""
-
-        given = self._nothing or self._given(data)
-
-        def add(b: NDArray[np.float64]) -> None:
-            for forms, part, values in zip(self.law_forms, data.parts, given, strict=True):
-                forms.residual.assemble_vector(b, part, values)
-
-        return self.summed(0, [add, *[one.takes_up for one in loads]])
+    def internal(self, data: QuadratureData, others: Sequence[Adds] = ()) -> NDArray[np.float64]:
+        """Return the nodal forces of the stresses, plus the forces that `others` add, in N."""
+        adders = []
+        for forms, part, values in zip(self.law_forms, data.parts, self._nothing or self._given(data), strict=True):
+            adders.append(partial(forms.residual.assemble_vector, data=part, given=values))
+        return self.summed(0, [*adders, *others])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K, without final assembly."""
@@ -348,9 +350,8 @@ class MomentumSystem:
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
         """Set the rounding errors of the residual at the active local nodes, in N."""
-        self.rounding.array_w[:] = nodes[
-            self._forms.active.now.nodes.searchsorted(self.unknowns.owned // self.unknowns.dim)
-        ]
+        at = self._forms.active.now.nodes.searchsorted(self.unknowns.owned // self.unknowns.dim)
+        self.rounding.array_w[:] = nodes[at]
         self.of_whole.array_w[:] = self.rounding.array_r * np.sqrt(self.of_parts.sizes)[self.of_parts.of]
 
     @property
@@ -420,9 +421,10 @@ class MomentumProblem:
         self.loads = tuple(loads)
         self._goes_on = goes_on
         self._tolerance = tolerance
-        self._varying = [one for one in loads if one.varies]
+        names = "dead", "loads", "resists", "takes_up", "pulls", "push", "inertia", "settle", "augment", "follow"
+        self._own = defined(loads, *names)
         with _compat.Timer("loads"):
-            external = forms.summed(1, [one.dead for one in loads])[system.touched]
+            external = forms.summed(1, self._own["dead"])[system.touched]
             self._external = external if held is None else external + held[system.touched]
 
     @property
@@ -442,11 +444,19 @@ class MomentumProblem:
 
     def settle(self, sticks: bool) -> bool:
         """Update stick and slip in contacts, and return whether any changed.  `sticks` allows slip to become stick."""
-        return any([one.settle(self.at, sticks) for one in self.loads])
+        changed = False
+        for settle in self._own["settle"]:
+            changed |= settle(self.at, sticks)
+        return changed
 
     def augment(self) -> bool:
         """Update multipliers and contact geometry after convergence, and return whether any force changed."""
-        return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
+        changed = False
+        for augment in self._own["augment"]:
+            changed |= augment(self.at)
+        for follow in () if changed else self._own["follow"]:
+            changed |= follow(self.at)
+        return changed
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements, in m, for Newton's method.
@@ -471,17 +481,17 @@ class MomentumProblem:
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
-        if pulls := [one.pulls for one in self.loads if one.stiff]:
+        if pulls := self._own["pulls"]:
             # penalty forces are not in the scale: at the start of a step they far exceed the other forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.nodal.ravel(), system.step)
         system.penalty.multAdd(step, r, r)
-        for one in self.loads:
-            one.push(self.at, r, system.unknowns)
-            if (inertia := one.inertia(self.at)) is not None:
-                r += inertia
-                norms.append(system.of_parts.norms(inertia.array_r))
+        for push in self._own["push"]:
+            push(self.at, r, system.unknowns)
+        for inertia in self._own["inertia"]:
+            r += (forces := inertia(self.at))
+            norms.append(system.of_parts.norms(forces.array_r))
         return r, np.maximum.reduce(norms)
 
     def unbalanced(self) -> NDArray[np.float64]:
@@ -491,14 +501,12 @@ class MomentumProblem:
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
         """Return the result of `unbalanced`, and the norms of its terms in each connected part, in N."""
         forms, system = self.forms, self.system
-        b = forms.internal(self.data, self.loads)
+        b = forms.internal(self.data, self._own["takes_up"])
         forces, external = b[system.touched], self._external
         terms = [forces]
-        if self._varying:
-            loads, own = (
-                forms.summed(1 + room, [getattr(one, name) for one in self._varying])[system.touched]
-                for room, name in enumerate(("loads", "resists"))
-            )
+        if self._own["loads"] or self._own["resists"]:
+            rooms = enumerate(("loads", "resists"), start=1)
+            loads, own = (forms.summed(room, self._own[name])[system.touched] for room, name in rooms)
             external, forces = external + loads, forces + own
             terms.append(own)
         b[system.touched] = forces - external
@@ -564,7 +572,12 @@ class MomentumProblem:
         for one in self.loads:
             at_walls, counted = one.counted(self.at)
             dofs, values = [*dofs, at_walls], [*values, -counted]
-        return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
+        grid, dofs = self.forms.grid, np.concatenate(dofs)
+        shares = self.forms.wall_shares((walls, dofs), partial(wall_shares, grid, walls, dofs))
+        out = grid.comm.allreduce(sum_by(dofs % grid.dim, shares * np.concatenate(values), grid.dim))
+        if grid.has_axis:
+            out[0, 0] = 0.0
+        return dict(zip(SIDES[grid.dim], out, strict=True))
 
     def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions and other results of the conditions at u, by quantity and name."""

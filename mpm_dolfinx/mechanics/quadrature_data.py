@@ -46,9 +46,7 @@ cells.  With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
     """Return the weight of the volume ratio from the corners of domains, at the start of a step."""
     stiffness = material.oedometric / material.shear
-    return (
-        np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
-    )
+    return np.minimum(1.0, np.maximum(2 - stiffness / STIFF_WET, 0.0) if wet else STIFF_DRY / stiffness)
 
 
 @dataclass(frozen=True)

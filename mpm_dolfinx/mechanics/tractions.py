@@ -38,23 +38,20 @@ class SideLoads(Acting):
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms
         self._loads = [(load, setting.sides.of(load)) for load in loads.values()]
+        self.surfaces = [faces for _, faces in self._loads]
+        """Faces with the loads."""
         self._placed: Latest[tuple[Exchange, Places]] = Latest()
         for load in loads.values():
             if not callable(load.value):  # values of functions are checked when they are called
                 self._given(load, 0.0, None)
 
-    @property
-    def surfaces(self) -> list[Surface]:
-        """Faces with the loads."""
-        return [faces for _, faces in self._loads]
-
     def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
         """Return integration points in owned cells, and the forces at these points, in N."""
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
-        both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
-        values = together(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
-        forces = [self._on(of, value, p, place.points) for (of, p), value in zip(both, values, strict=True)]
+        both, points = [*zip(self._loads, patches, strict=True)], place.points
+        values = together(grid.comm, lambda: [self._given(of, place.t, p.positions(points)) for (of, _), p in both])
+        forces = [self._on(of, value, p, points) for ((of, _), p), value in zip(both, values, strict=True)]
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
@@ -157,7 +154,7 @@ class Pressures(SideLoads):
 class PressureLoads(Loads):
     """Pressures in a substep."""
 
-    linear, varies = False, True
+    linear = False
 
     def __init__(self, forms: PressureForms, data: PointData):
         self._forms, self._data = forms, data

@@ -76,9 +76,7 @@ class OwnTermsOfStage(Acting):
 
     def __init__(self, terms: Sequence[OwnTerm], setting: Setting):
         self._grid, self.linear = setting.grid, all(term.slope is None for term in terms)
-        self._terms = [
-            (term, setting.sides.of(term.given) if isinstance(term.given, OnSide) else None) for term in terms
-        ]
+        self._terms = [(one, setting.sides.of(one.given) if isinstance(one.given, OnSide) else None) for one in terms]
         self.surfaces = [faces for _, faces in self._terms if faces is not None]
         self.seeded = [faces for term, faces in self._terms if term.seeded]
 
@@ -99,8 +97,6 @@ class OwnTermsOfStage(Acting):
 
 class OwnLoads(Loads):
     """Nodal forces of user-defined terms in a substep, integrated over bodies and sides."""
-
-    varies = True
 
     def __init__(self, terms: Sequence[tuple[OwnTerm, PointData]]):
         self._terms = terms

@@ -80,15 +80,15 @@ def simplices(dim: int) -> NDArray[np.int64]:
 def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the corners y (2^d, d, n) of domains, then in 3D the middles of faces, and last the middles of domains."""
     faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
-    return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
+    return np.concatenate([y, *(v[None] for v in faces), np.add.reduce(y)[None] / len(y)])
 
 
-def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains.  `v`: result of `vertices`."""
-    d, vertex = v.shape[1], simplices(v.shape[1]).T
+def simplex_volumes(v: NDArray[np.float64], most: int | None = None) -> NDArray[np.float64]:
+    """Return the signed volumes (k, n) of the simplices of domains, or of the first `most`.  `v`: see `vertices`."""
+    d, vertex = v.shape[1], simplices(v.shape[1])[:most].T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
-    volume = (_area_vectors(s) * height).sum(axis=0) / d
+    volume = np.add.reduce(_area_vectors(s) * height) / d
     return volume.reshape(vertex.shape[1], -1)
 
 
@@ -226,7 +226,8 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
     x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
     in_cells, y = on_planes(grid, true, x, 1)
     v = vertices(y)
-    flat = (~simplex_volumes(v).any(axis=0)).nonzero()[0]
+    flat = (simplex_volumes(v, 1)[0] == 0).nonzero()[0]
+    flat = flat[~np.logical_or.reduce(simplex_volumes(v[:, :, flat]))] if len(flat) else flat
     if len(flat):  # domains on a plane and thinner than the snapping distance: snapping would leave no volume
         in_cells[:, :, flat] = true[:, :, flat]
         y[:, :, flat] = x[:, :, flat]
@@ -239,7 +240,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
         s, facet = sliced(s, facet, axis, grid)
     s = slices_in_cells(grid, s)
     area = _area_vectors(s)
-    area *= np.sign((area * outward.take(facet, axis=1)).sum(axis=0))  # slicing has changed the order of vertices
+    area *= np.sign(np.add.reduce(area * outward.take(facet, axis=1)))  # slicing has changed the order of vertices
     return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second, faces)
 
 
@@ -257,8 +258,8 @@ class _Slots:
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
-        self.low = np.minimum(np.maximum(np.floor(y.min(axis=0)).astype(np.int64), 0), top)
-        self.high = np.minimum(np.maximum(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low), top)
+        self.low = np.minimum(np.maximum(np.floor(np.minimum.reduce(y)).astype(np.int64), 0), top)
+        self.high = np.minimum(np.maximum(np.ceil(np.maximum.reduce(y)).astype(np.int64) - 1, self.low), top)
         self._span = span = self.high - self.low + 1
         self._stride = np.array([np.multiply.reduce(span[axis + 1 :]) for axis in range(len(span))])
         count = self._stride[0] * span[0]
@@ -272,7 +273,7 @@ class _Slots:
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the slots of the domains `owner` (n,) and their cells with the grid indices `index` (d, n)."""
-        before = self._start - (self.low * self._stride).sum(axis=0)
+        before = self._start - np.add.reduce(self.low * self._stride)
         out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
         for place, stride in zip(index[:-1], self._stride, strict=False):
             out += place.astype(np.int64) * stride.take(owner)
@@ -298,9 +299,8 @@ def _sum(
 ) -> Pieces:
     """Return the pieces, one for each domain and cell, from sums over the slices of surfaces."""
     d = grid.dim
-    index = np.floor(s.sum(axis=0) / d)
-    least = s.min(axis=0)
-    most = s.max(axis=0)
+    index = np.floor(np.add.reduce(s) / d)
+    least, most = np.minimum.reduce(s), np.maximum.reduce(s)
     ends = []
     for a in range(d):
         # a slice on a grid plane belongs to the cell that contains the body
@@ -321,9 +321,9 @@ def _sum(
     @cache
     def pair(a: int, b: int) -> NDArray[np.float64]:
         """Return the products of two coordinates, summed over the vertices of the slices."""
-        return (x[:, a] * x[:, b]).sum(axis=0)
+        return np.add.reduce(x[:, a] * x[:, b])
 
-    sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
+    sums, products = np.add.reduce(x), area[0] / (d * (d + 1))
     rows = [area[0], area[0] * sums[0] / d, products / 2 * (sums[0] ** 2 + pair(0, 0))]
     for a in range(1, d):
         rows += [products * (sums[0] * sums[a] + pair(0, a)), area[0] * sums[a] / d]
@@ -353,12 +353,12 @@ def _sum(
         else:
             area[1] *= grid.lines[0][index[0].astype(int)] + grid.widths[0][index[0].astype(int)] * (r - index[0])
     sections = np.empty((d * faces, 2, len(kept)))
-    for a, section in enumerate(sections):
+    for a, part in enumerate(sections):
         shadow = total(area[a]) if a else shadow
         beyond = slots.beyond(shadow, a)
         lower, upper = total(area[a], ends[a][0]), total(area[a], ends[a][1])
         # areas of the body's sections just above the lower and just below the upper face
-        np.multiply([(beyond + shadow - lower)[kept], (beyond + upper)[kept]], h.prod(axis=0) / h[a], out=section)
+        np.multiply([(beyond + shadow - lower)[kept], (beyond + upper)[kept]], np.multiply.reduce(h) / h[a], out=part)
 
     # centroids are kept away from grid lines, inside the cell of the piece
     volume = volume[kept]
@@ -368,13 +368,11 @@ def _sum(
     centroid = np.minimum(np.maximum(middle, grid.snap), 1 - grid.snap)
     for (a, b), product in zip(pairs, uneven, strict=True):
         # rounding may spoil the mean in very thin pieces: it is clipped to its exact range
-        mean = np.minimum(
-            np.maximum(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25), 0.25
-        )
+        mean = product[kept] / volume - middle[:, a] * middle[:, b]
+        mean = np.minimum(np.maximum(mean, 0.0 if a == b else -0.25), 0.25)
         spread[:, a, b] = spread[:, b, a] = mean * h[a] * h[b]
-    mixed = (
-        np.stack([spread[:, 1, 2], spread[:, 0, 2], spread[:, 0, 1]], axis=1) if d == 3 else np.zeros((len(kept), 0))
-    )
+    columns = [(1, 2), (0, 2), (0, 1)] if d == 3 else []
+    mixed = np.array([spread[:, a, b] for a, b in columns]).T.copy().reshape(len(kept), len(columns))
     if grid.axisymmetric:
         ends = cell[:, [0]] + [0, 1]
         if faces:
@@ -487,7 +485,7 @@ def cut_faces(
     count = whole.shape[2]
     # sizes are computed from local coordinates, which are never degenerate; a triangle is half of a face
     size = _size(whole[:, d:]).reshape(len(split), m)
-    share = (size / size.sum(axis=0)).ravel()
+    share = (size / np.add.reduce(size)).ravel()
     s = np.concatenate([whole, np.eye(d)[:, :, None].repeat(count, axis=2)], axis=1)  # last: barycentric coordinates
     owner = np.arange(count)
     for axis in range(d):
@@ -562,7 +560,7 @@ def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return lengths of segments, or areas of triangles, up to a constant factor."""
     e = s[1:] - s[0]
     if len(e) == 1:
-        return np.sqrt((e[0] ** 2).sum(axis=0))
+        return np.sqrt(np.add.reduce(e[0] ** 2))
     a, b = e  # a determinant of a . b would lose thin triangles in rounding
     return np.sqrt(sum((a[i] * b[j] - a[j] * b[i]) ** 2 for i, j in combinations(range(len(a)), 2)))
 
@@ -581,7 +579,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
         least, most = np.minimum.reduce(s[:, axis]), np.maximum.reduce(s[:, axis])
         plane = np.floor(least) + 1 if grid.even else grid.next_plane(axis, least)
         crossing = most > plane
-        if not crossing.any():
+        if not np.logical_or.reduce(crossing):
             break
         below, below_owner, *above = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
         done_s += [s.compress(~crossing, axis=2), below]
@@ -596,8 +594,7 @@ def cut_at(s, owner, axis: int, plane):
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
     dim = len(s) - 1
-    parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}
-    owners = {"below": [owner[:0]], "above": [owner[:0]]}
+    parts, owners = {"below": [], "above": []}, {"below": [], "above": []}
     for k in range(1, dim + 1):
         chosen = (count == k).nonzero()[0]
         v, c = s.take(chosen, axis=2), plane[chosen]
@@ -606,9 +603,10 @@ def cut_at(s, owner, axis: int, plane):
             for j in range(k, dim + 1):
                 points[i, j] = _on_plane(v[i], v[j], axis, c)
         for where, simplices in _CUTS[dim][k].items():
-            parts[where] += [np.array([points[p] for p in simplex]) for simplex in simplices]
+            parts[where] += [np.array(list(map(points.__getitem__, simplex))) for simplex in simplices]
             owners[where] += [owner[chosen]] * len(simplices)
-    return [np.concatenate(rows[where], axis=-1) for where in ("below", "above") for rows in (parts, owners)]
+    found = parts["below"], owners["below"], parts["above"], owners["above"]
+    return [rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1) for rows in found]
 
 
 def _on_plane(a, b, axis: int, plane):

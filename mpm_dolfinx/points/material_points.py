@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
@@ -175,10 +176,12 @@ class MaterialPoints:
         """Return positions (n, d), in m, inside the domains.  These are `x`, except for partly inverted domains."""
         return centroids(self.corners, within=True)
 
-    @property
+    @cached_property
     def J(self) -> NDArray[np.float64]:
         """Volume ratio det F (n,)."""
-        return determinant(self.F)
+        J = determinant(self.F)
+        J.flags.writeable = False
+        return J
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:

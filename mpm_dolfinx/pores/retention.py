@@ -308,9 +308,7 @@ class Retentions:
         """
         row = points.retention
         p = self.at(p, points)
-        values = [
-            property_of(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first
-        ]
+        values = [property_of(_lifted(of, [row[1 + i] for i in range(self.width - 1)]), name, p) for of in self._first]
         out = values.pop(0) if self._everywhere else 1.0
         first = 2 if self._everywhere else 1
         for number, value in enumerate(values, first):

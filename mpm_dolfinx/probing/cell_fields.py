@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mass_potential
-from mpm_dolfinx.grid.grid import means_of_rows, sum_by
+from mpm_dolfinx.grid.grid import means_of_rows
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -59,7 +59,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
     cut, places = on_grid.cut, on_grid.data.pieces.places
     weight = cut.shares(points.volume0 * points.J)
-    volume = sum_by(places.slots, weight, len(places.filled))
+    volume = places.total(weight)
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the volume-weighted mean, in each cell, of the values of its pieces."""
@@ -81,7 +81,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
             share, full = share * cut.pieces_to_cells(chi), cut.pieces_to_cells(full)
             volumes -= (1 - full) * pores * np.exp(pressure / scene.fluid.bulk)[places.slots]
         defect = cut.to_cells(points.data["owed"] / points.J)
-        water = sum_by(places.slots, weight * (volumes - defect), len(volume))
+        water = places.total(weight * (volumes - defect))
         stress = effective - (mean(share) * pressure)[:, None, None] * np.eye(scene.grid.stretches)
     x = mean(cut.x) + cut.grid.base
     return CellFields(places.filled, x, volume, moved, effective, stress, pressure, water)

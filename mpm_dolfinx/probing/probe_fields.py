@@ -214,9 +214,7 @@ class _Around:
             own_cells, other_cells = pair
             inward = (1 - 2 * end, 2 * end - 1)  # signs of directions from the face into both cells
             size, offset = self._lattice.size[:, :, axis], (self._half + self._shift)[:, :, axis]
-            lengths = [
-                np.maximum(size[:, i] / 2 + sign * offset[:, i], 0) for sign, i in zip(inward, pair, strict=True)
-            ]
+            lengths = [np.maximum(size[:, i] / 2 + s * offset[:, i], 0) for s, i in zip(inward, pair, strict=True)]
             with np.errstate(divide="ignore", invalid="ignore"):
                 own, other = (length / self._kappa[:, i, axis] for length, i in zip(lengths, pair, strict=True))
                 share = own / (own + other)

@@ -146,18 +146,20 @@ class Gathered:
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        if self._here:
-            self._factors.factorise()
+        if self._factors.latest.value is not None:  # on the process of the factors
+            self._factors.latest.value.factorise()
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Set y to the solution for the right-hand side x."""
+        factors = self._factors.latest.value
         if self._scatter is None:
-            y.array_w[:] = self._factors.solve(x.array_r)
+            if factors is not None:
+                y.array_w[:] = factors.solve(x.array_r)
             return
         insert = PETSc.InsertMode.INSERT
         self._scatter.scatter(x, self._whole, insert, PETSc.ScatterMode.FORWARD)
-        if self._here:
-            self._whole.array_w[:] = self._factors.solve(self._whole.array)
+        if factors is not None:
+            self._whole.array_w[:] = factors.solve(self._whole.array)
         self._scatter.scatter(self._whole, y, insert, PETSc.ScatterMode.REVERSE)
 
 
@@ -168,30 +170,42 @@ class SingleFactors:
     """
 
     def __init__(self, name: str, symmetric: bool):
-        self._name, self._symmetric = f"{name}_gathered", symmetric
-        self._solver: Latest[tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]] = Latest()
+        self._options = f"{name}_gathered", symmetric
+        self.latest: Latest[RowFactors] = Latest()
+        """The last factors, or None."""
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Set the matrix, in compressed rows."""
-        A = self._solver((rows, columns), lambda: self._of(rows, columns))[0].getOperators()[0]
-        A.setValuesCSR(rows, columns, values)
-        A.assemble()
+        self.latest((rows, columns), lambda: RowFactors(rows, columns, *self._options)).take(values)
+
+
+class RowFactors:
+    """Factors of matrices with one sparsity pattern, by `direct_solver`.
+
+    `rows`, `columns`: the sparsity pattern, in compressed rows.
+    """
+
+    def __init__(self, rows: NDArray[np.int32], columns: NDArray[np.int32], name: str, symmetric: bool):
+        csr = rows, columns, np.zeros(len(columns))
+        self._matrix = PETSc.Mat().createAIJ(len(rows) - 1, csr=csr, comm=PETSc.COMM_SELF)
+        self._pattern = rows, columns
+        self._solver = direct_solver(self._matrix, name, symmetric, gathered=True)
+        self._x, self._b = self._matrix.createVecs()
+
+    def take(self, values: NDArray[np.float64]) -> None:
+        """Set the entries of the matrix to `values`, in the order of the pattern."""
+        self._matrix.setValuesCSR(*self._pattern, values)
+        self._matrix.assemble()
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        self._solver.value[0].pc.setUp()  # PETSc's KSPSetUp ignores a change of entries alone
-
-    def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
-        """Return a solver for matrices with this sparsity pattern, and vectors for solution and right-hand side."""
-        A = PETSc.Mat().createAIJ(len(rows) - 1, csr=(rows, columns, np.zeros(len(columns))), comm=PETSc.COMM_SELF)
-        return direct_solver(A, self._name, self._symmetric, gathered=True), *A.createVecs()
+        self._solver.pc.setUp()  # PETSc's KSPSetUp ignores a change of entries alone
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution for the right-hand side b."""
-        ksp, x, right = self._solver.value
-        right.array_w[:] = b
-        ksp.solve(right, x)
-        return x.array_r
+        self._b.array_w[:] = b
+        self._solver.solve(self._b, self._x)
+        return self._x.array_r
 
 
 class NodalFactors:
@@ -209,22 +223,14 @@ class NodalFactors:
         rows = (block, axis, unknowns.positions)
         self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # all on process 0
         self._dim, self._symmetric = unknowns.dim, symmetric
-        self._factors: Latest[BlockFactors] = Latest()
+        self.latest: Latest[BlockFactors] = Latest()
+        """The last factors, or None."""
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Set the matrix, in compressed rows."""
         if len(rows) > 1:  # otherwise walls fix all nodes, and the matrix is empty, which PETSc rejects
             make = (rows, columns, *self._nodes, self._dim, self._symmetric)
-            self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
-
-    def factorise(self) -> None:
-        """Factorise the matrix if it has changed."""
-        if self._factors.value is not None:
-            self._factors.value.factorise()
-
-    def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the solution for the right-hand side b, for all unknowns."""
-        return self._factors.value.solve(b) if len(b) else b
+            self.latest((rows, columns), lambda: BlockFactors(*make)).take(values)
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -206,9 +206,12 @@ class Newton:
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
         forms, active = momentum.forms, momentum.forms.active.now
-        self._vectors = [(forms.u.x, active.dofs)]
+        u = forms.u.x
+        self._vectors, self._moved = [(u, active.dofs)], [(u, momentum.system, solvers.du)]
         if storage is not None:
-            self._vectors.append((storage.forms.p.x, active.cells))
+            p = storage.forms.p.x
+            self._vectors.append((p, active.cells))
+            self._moved.append((p, storage.system, solvers.dp))
 
     def newton(self, as_reset: AsReset, key: Hashable, reusable: bool, ahead: Callable | None) -> Errors:
         """Solve the balances by Newton's method. A tangent is reused while the iterations converge.
@@ -360,7 +363,7 @@ class Newton:
                 raise NotConverged(f"the {name} iteration diverges ({why})", report.history) from failed
             with _compat.Timer("linear solve"):
                 dp = self._solvers.solve_storage()
-            self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
+            self._storage.system.unknowns.add(self._storage.forms.p.x, -1.0, dp)
             report.coupling += 1
             if self._storage.settle():
                 self._linearise()
@@ -506,11 +509,8 @@ class Newton:
 
     def _move(self, steps: NDArray[np.float64]) -> None:
         """Add fractions of the Newton direction to u and p in each part."""
-        system = self._momentum.system
-        system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
-        if self._storage is not None:
-            system = self._storage.system
-            system.unknowns.add(self._storage.forms.p, steps[system.of_parts.of], self._solvers.dp)
+        for x, system, direction in self._moved:
+            system.unknowns.add(x, steps[system.of_parts.of], direction)
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -124,11 +124,11 @@ class Motion:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
                 points = state.points.strained(F, x=x, corners=corners)
-                keeps, folded = on_grid.valid(points, loads), 0
+                keeps, folded = on_grid.valid(cut.crossed(points), loads), 0
             self._check_volumes(points, cut)
             if carried is not None:
                 part, count = on_grid.parts
-                moved = np.where(keeps & stays, 0.0, cut.moved(points, part, count)[part])
+                moved = np.where(keeps & stays, 0.0, cut.moved(cut.crossed(points), part, count)[part])
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
             if (data_now := self._materials.updated_state(points, state.points, t - state.t)) is not points.data:
@@ -146,7 +146,8 @@ class Motion:
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and net_inflow is not None:
                     undrained = partial(self._undrained, state, on_grid, data, loads)
-                    defect = self._volume_defect(state, points, on_grid, undrained, net_inflow, keeps)
+                    storage = cut.to_pieces(pieces["storage"][:, 0])
+                    defect = self._volume_defect(state, points, on_grid, storage, undrained, net_inflow, keeps)
                 now = self.pressures(on_grid, state.stage, t, nodal)
                 points = replace(points, pressure=now, data=points.data | defect)
             _check_inside(cut, points, t, report)
@@ -191,7 +192,7 @@ class Motion:
         origin = change[:, :d] - (slope @ points.x[:, :, None])[:, :, 0]
         rows = np.concatenate([origin, slope.reshape(n, d * d), change[:, d + d * d :]], axis=1)
         rows = np.concatenate([pieces.volume[None], pieces.volume * cut.to_cells(rows).T])
-        sums = sum_by(places.slots, rows, len(places.filled))
+        sums = places.total(rows)
         volume, sums = sums[0], sums[1:]
         moved, slope = sums[:d], sums[d : d + d * d].reshape(d, d, -1).transpose(2, 1, 0)
         moved = moved[:, :, None] + (grid.node_x[grid.cell_nodes[places.filled]] @ slope).transpose(2, 0, 1)
@@ -299,10 +300,12 @@ class Motion:
         for one in loads:
             corners = one.outside(corners, own)
         points = replace(state.points, corners=corners)
-        keeps, evolved = on_grid.valid(points, loads), self._materials.evolved(points)
+        crossed = cut.crossed(points)
+        keeps, evolved = on_grid.valid(crossed, loads), self._materials.evolved(points)
         if over_all(grid.comm, int(not keeps.all())):
             free &= ~keeps[:, None, None]
-            corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
+            crossed = np.add.reduce(crossed, axis=2) * ~evolved[:, None]
+            corners = corners + free * filtered(grid, stage.lattices, points, crossed)
             bad = ~keeps & tangled(corners, points.volume0 * points.J, grid.axisymmetric)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
@@ -351,11 +354,14 @@ class Motion:
         state: State,
         points: MaterialPoints,
         on_grid: OnGrid,
+        storage: NDArray[np.float64],
         undrained: Callable[[], NDArray[np.bool_]],
         net_inflow: NDArray[np.float64],
         keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defects of the points after a step, per reference volume, and their corrections.
+
+        `storage` (m,), 1/Pa: storage coefficients of the pieces at the start of the step.
 
         The step adds `(c - q) / alpha` to the defect.  Here c is the increase of the fluid content according to volumes
         and cell pressures, q is the net inflow, and alpha is Biot's coefficient.  Soil with a specific yield has no
@@ -372,9 +378,8 @@ class Motion:
         density = np.exp((p + p_n) / (2 * forms.bulk))
         dp, density, inflow_here = map(cut.to_pieces, (p - p_n, density, density * net_inflow[at] / volume))
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
-        rows = (alpha, at_one, materials.storage(before), points.J / before.J)
-        rows = (values[cut.pieces.point] for values in rows)
-        grown = change_at_points(*rows, dp)
+        biot, of_one, ratio = [values[cut.pieces.point] for values in (alpha, at_one, points.J / before.J)]
+        grown = change_at_points(biot, of_one, storage, ratio, dp)
         if materials.retentions is not None:
             of, pores = cut.pieces.point, materials.porosity(before)
             heads = on_grid.heads
@@ -386,7 +391,7 @@ class Motion:
         if not over_all(cut.grid.comm, int(not keeps.all())):
             return {"owed": defect, "due": np.zeros(len(points))}
         part, count = on_grid.parts
-        share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
+        share = -np.expm1(-TAKES_IN * cut.moved(cut.crossed(points), part, count))[part]
         weight = points.volume0 * ~none
         total, whole = over_all(cut.grid.comm, sum_by(part, np.array([weight * defect, weight]), count))
         mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * undrained()
@@ -449,9 +454,8 @@ class Motion:
             on_grid.set_pressures(carried.of_cell)
             water = on_grid.pore_water(points)
             at_rest = None if water is None else self._at_rest(stage, t, None)
-            pressure, slope, bounds = on_grid.pressures_at_pieces(
-                self._reconstruction, pieces.fraction * store[pieces.point], stage, t, water, at_rest
-            )
+            of_pieces = self._reconstruction, pieces.fraction * store[pieces.point]
+            pressure, slope, bounds = on_grid.pressures_at_pieces(*of_pieces, stage, t, water, at_rest)
         none = {} if some else {"of_cell": None, "start": None}
         return replace(carried, pressure=pressure, slope=slope, bounds=bounds, **none)
 
@@ -464,9 +468,8 @@ def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Rep
     if grid.outside(x.reshape(-1, grid.dim), REACH).any():
         beyond = np.maximum(grid.low - x, x - grid.high).max(axis=2)
         i, corner = np.unravel_index(np.argmax(np.where(np.isnan(beyond), np.inf, beyond)), beyond.shape)
-        of = f"point {points.id[i]} at {points.x[i] + grid.base}" + (
-            f": its corner at {x[i, corner] + grid.base}" if cut.domains else ""
-        )
+        of = f"point {points.id[i]} at {points.x[i] + grid.base}"
+        of += f": its corner at {x[i, corner] + grid.base}" if cut.domains else ""
         by = f"by {beyond[i, corner]:.3g} m at t = {t:g} s"
         message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay inside: use a larger grid"
     if message := first(grid.comm, message):

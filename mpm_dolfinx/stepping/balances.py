@@ -48,6 +48,7 @@ class Start(NamedTuple):
     yielded: bool  # whether soil has yielded before, on any process
     acting: list[Acting]  # loads of each substep
     renewed: int = 0  # number of renewed particle domains
+    due: NDArray[np.float64] | None = None  # corrections of volume defects, see `OnGrid.start`
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
         """Return the loads at the beginning of a substep. `earlier`: data of the loads in the previous substep."""
@@ -212,7 +213,7 @@ def balances(
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
     fed = matrices.flow(start.state, weight, start.data, acting.t, dt, acting.loads, momentum.at)
     lost = before and before.integrated(substep.before * dt)
-    carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
+    carried = on_grid.softness(start.state), substep.end * start.due
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     moves = None
     if inertia is not None:

@@ -25,12 +25,11 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
-from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets, off_middle
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
-from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import FULL, stiffness
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
@@ -78,9 +77,8 @@ class OnGrid(Keyed):
         area, x = cut.plane(weight)
         scales = stiffness, lambda m: m.shear if m.state else 0.0  # only yielding laws need regularisation
         moduli = [area * self._rows(scale) for scale in scales]
-        own, slots = self._places.pieces.filled, self._places.pieces.slots
-        contents = (sum_by(slots, rows, len(own)) for rows in (area, *moduli))
-        self.active = momentum.set_contents(own, *contents)
+        own = self._places.pieces.filled
+        self.active = momentum.set_contents(own, *self._places.pieces.total(np.array([area, *moduli])))
         """The cells that contain material."""
         self.cells = self.active.cells
         self.fill = np.zeros(grid.num_local)
@@ -161,15 +159,20 @@ class OnGrid(Keyed):
         with _compat.Timer("integration data"):
             return self._quadrature.data(self.cut, self._places, state.points)
 
-    def start(self, state: State) -> None:
-        """Set the pressures at the start of a step."""
+    def start(self, state: State) -> NDArray[np.float64] | None:
+        """Set the pressures at the start of a step.  Return the corrections (n,), m^d, of volume defects in the step.
+
+        The result refers to the filled owned cells, and is None without fluid.
+        """
         if self._storage is None:
-            return
+            return None
         with _compat.Timer("remap"):
             p_n = self._storage.p_n.x
             p_n.array[self.contents.filled] = self.pressures(state)
             p_n.scatter_forward()
         self._storage.p.x.array[self.cells] = p_n.array[self.cells]
+        share = self.cut.shares(state.points.volume0 * state.points.data["due"])
+        return self.contents.total(self.data.pieces["biot"][:, 0] * share)
 
     def pressures(self, state: State) -> NDArray[np.float64]:
         """Return the pressures (Pa) of the filled owned cells at the start of a step."""
@@ -255,8 +258,8 @@ class OnGrid(Keyed):
         contents, points = self.contents, self.cut.points
         store = self.cut.shares(self._materials.storage(points) * points.volume0 * points.J)
         potential = self.cut.pieces_to_cells(at_pieces)
-        held, mean = contents.total(store), contents.mean(potential)
-        return np.divide(contents.total(store * potential), held, out=mean, where=held > 0)
+        held, moment, mean = contents.total(np.array([store, store * potential, contents.weight * potential]))
+        return np.divide(moment, held, out=mean / contents.volume, where=held > 0)
 
     def pressures_at_pieces(
         self,
@@ -286,8 +289,8 @@ class OnGrid(Keyed):
         at = contents.slot(pieces.cells)
         store = self.cut.pieces_to_cells(store)
         weight = np.where(contents.total(store)[at] > 0, store, self.weight)
-        total = contents.total(weight)
-        origin = (contents.total(weight * offset.T) / total).T
+        total, *moments = contents.total(np.concatenate([weight[None], weight * offset.T]))
+        origin = (moments / total).T
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.add.reduce(slope[at] * (offset - origin[at]), axis=1), seen.p[contents.filled]
@@ -311,11 +314,6 @@ class OnGrid(Keyed):
         """Return the ratio (m,) of the elastic to the tangent shear modulus of the pieces at the start of the step."""
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
-
-    def due(self, state: State) -> NDArray[np.float64]:
-        """Return the corrections (m^d) of the volume defects in the filled owned cells in a step."""
-        share = self.cut.shares(state.points.volume0 * state.points.data["due"])
-        return self.contents.total(self.data.pieces["biot"][:, 0] * share)
 
     def pressures_up_to_surface(
         self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
@@ -430,10 +428,13 @@ class OnGrid(Keyed):
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return (self.contents.total(moves) == 0).nonzero()[0]
 
-    def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points that may keep their pieces, because their connected part hardly moves."""
+    def valid(self, crossed: NDArray[np.float64], loads: Sequence[Loads]) -> NDArray[np.bool_]:
+        """Return a mask (n,) of points that may keep their pieces, because their connected part hardly moves.
+
+        `crossed`: see `CutDomains.crossed`.
+        """
         part, count = self.parts if self.cut.grid.copies == 1 else self.parts_of_points(loads)
-        return self.cut.valid(points, part, count)[part]
+        return self.cut.valid(crossed, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
         """Return the index of the connected part of each cell, and the number of parts. Contact connects parts."""
@@ -624,22 +625,21 @@ class Assembled(Keyed):
         gradients = None if self._off is None else self._gradients(where, fit)
         off = gradients and (self._off, gradients, sides)
 
-        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
+        def set_fluxes(begins: bool, nodal: NDArray[np.float64] | None = None) -> Outflow:
+            motion = None if nodal is None else contents.motion(nodal, rests)
+            flow = Conduction(steady or mobility(begins), motion, weight, self._bulk)
+            return self.storage.set_fluxes(contents, feeds, flow, off)
 
+        rests = steady = None
         if state.stays and not self._varies:
-            of_cut = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
+            of_cut = self._outflow((at, weight, *varies), partial(set_fluxes, True), grid.comm)
             return feeds, lambda begins: of_cut
-        rests = on_grid.rests(state) if not self._varies else None
-
-        # a substep begins at the end of the previous one
-        at_u, steady = (data.pieces.key, weight, *varies), None if self._varies else mobility(True)
-
-        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
-            return set_fluxes(steady or mobility(begins), contents.motion(nodal, rests))
+        if not self._varies:
+            rests, steady = on_grid.rests(state), mobility(True)
+        at_u = (data.pieces.key, weight, *varies)  # a substep begins at the end of the previous one
 
         def outflow(begins: bool) -> Outflow:
-            nodal = contents.nodal(u)
-            return self._outflow((*at_u, nodal), partial(at_present, nodal, begins), grid.comm)
+            nodal = u[contents.nodes]
+            return self._outflow((*at_u, nodal), partial(set_fluxes, begins, nodal), grid.comm)
 
         return feeds, outflow

@@ -245,7 +245,7 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
     when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
     residual, _ = scene.balance(when, system, start.data, loads, 0.0).assemble_residual()
     forms.u.x.array[:] = 0.0
-    system.unknowns.add(forms.u, 1.0, residual)
+    system.unknowns.add(forms.u.x, 1.0, residual)
     return replace(state, held=forms.u.x.array.copy())
 
 
@@ -453,7 +453,7 @@ def balanced(scene: Scene, state: State) -> State:
             residual, scale = problem.assemble_residual()
             left = residual.norm() / max(scale, start.matrices.round_off)
             if left**2 < best[0] ** 2 / 2:
-                unknowns.add(forms.u, 1.0, residual)
+                unknowns.add(forms.u.x, 1.0, residual)
                 held, forms.u.x.array[:] = forms.u.x.array.copy(), 0.0
                 best = left, count, points, held, w, problem.outcome()
             if left <= scene.scheme.tolerance:

@@ -157,9 +157,8 @@ class Scene:
     @property
     def substeps(self) -> tuple[Substep, ...]:
         """Substeps of each step."""
-        return substeps(
-            self.numerics.method, self.flows or self.momentum.own.rates or self.momentum.inertia is not None
-        )
+        evolves = self.flows or self.momentum.own.rates or self.momentum.inertia is not None
+        return substeps(self.numerics.method, evolves)
 
     def balance(
         self,
@@ -176,7 +175,8 @@ class Scene:
         `system`, `data`, `loads`, `options`: see `MomentumProblem`.
         `u` (unknowns,), m: initial guess of the displacements, as a local array.  Default: present displacements.
         """
-        self.t.value, self.dt.value = when.t, when.since
+        self.t.value.fill(when.t)
+        self.dt.value.fill(when.since)
         if when.gravity is not None:
             self.gravity.value = when.gravity
         self.momentum.velocity.set(when.own, when.past, self.momentum.active.now.dofs)

@@ -131,7 +131,7 @@ class Stage:
         """Whether bodies have inertia."""
         return self.conditions["inertia"]
 
-    @property
+    @cached_property
     def surfaces(self) -> list[Surface]:
         """Faces of all conditions except tools and contacts."""
         return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]

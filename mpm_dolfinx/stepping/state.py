@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
@@ -23,11 +24,13 @@ from mpm_dolfinx.stepping.stage import Stage
 
 def _freeze(kept: Mapping[str, Any]) -> None:
     """Make all arrays of a mapping read-only."""
-    for values in kept.values():
-        if isinstance(values, np.ndarray):
-            values.flags.writeable = False
-        elif isinstance(values, dict):
-            _freeze(values)
+    left = [kept]
+    for one in left:
+        for values in one.values():
+            if isinstance(values, np.ndarray):
+                values.flags.writeable = False
+            elif isinstance(values, dict):
+                left.append(values)
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class Trend:
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
         if first:
             powers = powers - seconds / first * (first / last) ** order * order
-        shares = np.linalg.solve((ends**order).T, powers)
+        shares = dgesv((ends**order).T, powers)[2]
         weights = -self.lengths * shares[::-1].cumsum()[::-1]
         return np.add.reduce(self.rates * weights[:, None], axis=1)
 

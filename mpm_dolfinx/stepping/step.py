@@ -40,9 +40,9 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
     matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
     scene.momentum.u.x.array[scene.momentum.active.now.dofs] = 0.0
-    on_grid.start(state)
+    due = on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
-    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed)
+    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed, due)
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
