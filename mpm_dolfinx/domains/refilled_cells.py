@@ -418,7 +418,7 @@ class RefilledCells:
         row, quads, edge = replace(polygons, x=inside).simplified(near).quadrilaterals()
         piece = left[of[row]]
         large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
-        large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # as if there were no crumbs
+        large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # crumbs change no numbers
         piece, quads, edge = (values[large] for values in (piece, quads, edge))
         left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
