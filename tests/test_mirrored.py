@@ -70,8 +70,9 @@ def test_the_filter_takes_the_mean_of_corners_that_coincide_nearly():
     mirrored[other] = d[:, [1, 0, 3, 2]] * [-1, 1]
     changes = []
     for of in (d, mirrored):
-        now, then = (replace(points, corners=X + values) for values in (of, of - 0.3))
-        changes.append(filtered(grid, lattices([body], [True], []), now, then, np.ones(len(points), dtype=bool)))
+        now = replace(points, corners=X + of)
+        crossed = np.full(X.shape[:2], 0.6 / grid.least)  # the corners have moved by 0.3 m along each axis
+        changes.append(filtered(grid, lattices([body], [True], []), now, crossed))
     assert np.abs(changes[0]).max() > 1e-5
     assert np.abs(changes[1][other] - changes[0][:, [1, 0, 3, 2]] * [-1, 1]).max() < 1e-15
 
