@@ -194,7 +194,7 @@ def vibrating(cells: int) -> dict[str, np.ndarray]:
 
 def stable(cells: int) -> dict[str, float]:
     """Return the factor of safety of a slope."""
-    return {"factor": mpm.factor_of_safety(slopes.slope(cells), rtol=0.01, progress=False).factor}
+    return {"factor": mpm.factor_of_safety(slopes.slope(cells), rtol=0.0025, progress=False).factor}
 
 
 SCENES = {

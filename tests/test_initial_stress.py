@@ -249,7 +249,7 @@ def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
         ({"initial_stress": lambda x: x}, "must be three normal stresses or a symmetric tensor"),
         ({"gravity": (1.0, -9.81)}, r"K0 with gravity = \[1.0, -9.81\], gravity must point down"),
         ({"pressure": lambda x: np.nan}, r"pressure\(x\) = nan, must be a finite number, or one for each"),
-        ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "must be inside the yield surface of MohrCoulomb"),
+        ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "for soil too weak for this stress, omit"),
         ({"law": "mohr-coulomb", "initial_stress": mpm.K0(5.0)}, r"principal stresses .* degrees allows K0 from .* to"),
         ({"law": "mohr-coulomb", "level": 6.0}, "K0 needs the weight of open water as surcharge"),
         ({"law": "cam clay", "initial_stress": lambda x: np.tile([0, 1e4, 0], (len(x), 1))}, "a compressive mean"),
@@ -267,6 +267,16 @@ def test_open_water_without_a_surcharge_is_warned_of(law, recwarn):
     assert not [one for one in recwarn if "tension" in str(one.message)]
     with pytest.warns(mpm.ConditionWarning, match="K0 gives vertical tension, such as .* water as surcharge"):
         ground(law, level=6.0)
+
+
+def test_loads_beyond_the_limit_load_have_no_initial_state():
+    """A vertical cut, 2 m high, under a load on its crest."""
+    grid = mpm.Grid([0, 0], [6, 3], [12, 6])
+    clay = mpm.MohrCoulomb(bulk=5e7, shear=1e7, friction=0.0, dilation=0.0, cohesion=2e4)
+    load, cut = mpm.Traction("top", (0, -6e4)), [mpm.box(grid, [0, 0], [4, 2])]
+    options = {"walls": {"left": "x", "bottom": "xy"}, "gravity": (0, -9.81), "conditions": [load]}
+    with pytest.raises(ValueError, match="limit load, omit initial_stress or apply them in later"):
+        mpm.Simulation(grid, cut, [clay], initial_stress=mpm.K0(0.8), **options)
 
 
 @pytest.mark.parametrize("value", [-0.1, np.inf, "half"])

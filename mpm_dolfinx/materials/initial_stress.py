@@ -419,4 +419,5 @@ def _outside_yield(materials: SceneMaterials, points: MaterialPoints, target: ND
         )
     stress = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(target[i]))
     where = points.x[i] + materials.grid.base
-    return f"initial_stress at {where}: principal stresses {stress} Pa, must be {allowed}{more}"
+    hint = "; for soil too weak for this stress, omit initial_stress"
+    return f"initial_stress at {where}: principal stresses {stress} Pa, must be {allowed}{more or hint}"

@@ -8,6 +8,9 @@ computes the motion in time.  The criterion is the overload, the ratio of the vi
 the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide, the overload approaches the
 missing strength divided by the present strength, for any viscosity and cell size.
 
+The viscosity of a point follows from its own strength and stiffness, and each connected part of the bodies has its own
+overload.  Soil far from a slide therefore hardly affects the result, even if it is soft or yields under its own weight.
+
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
 Bodies that are not in equilibrium get elastic stresses.
 """
@@ -22,7 +25,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
-from dolfinx import fem
 from numpy.typing import NDArray
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -49,16 +51,17 @@ WIDER, WIDEST = 2**0.5, 16.1
 LACKS = 0.25
 """Largest overload with which a body counts as being at rest, divided by `rtol`.
 
-Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value
-by 5.4e-03. Finer cells change it by 4.2e-02.
+Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the result by 5.4e-03, and twice this value
+by 1.4e-03. Finer cells change it by 4.0e-02.
 """
 STRAINS = 4.0
-"""Total strain of a trial that barely slides, divided by the minimum of its overload and the elastic strain at yield.
+"""Shear strain of a trial that barely slides, divided by the minimum of its overload and the elastic strain at yield.
 
-Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Sensitivity (scene "safety" of
-tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value by 1.1e-02.  Finer cells change
-it by 4.2e-02.
+Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the result by 8.1e-03, and twice this value
+by 1.4e-02.  Finer cells change it by 4.0e-02.
 """
+CREEP, PART = "creep_viscosity", "part"
+"""Fields of the points: viscosity in a trial, in Pa s, and index of the connected part of the bodies."""
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
 
@@ -73,7 +76,8 @@ class Safety:
         Largest factor of a trial that came to rest, and smallest factor of a trial with a slide.
     overloads
         Dictionary from the factor of each trial to the overloads (n,) in its n steps.  The overload of a step is the
-        work of the viscous stress, divided by the work of the shear stress, in soil that may yield.
+        work of the viscous stress, divided by the work of the shear stress, in soil that may yield.  If the bodies have
+        several connected parts, it is the largest overload of a part.
     newton
         Number of Newton steps of all trials.
     """
@@ -104,6 +108,7 @@ def factor_of_safety(
     dt
         Length of a step, in s, > 0.  The step must be long compared with viscous time scales of laws and terms.  If
         fluid flows, `dt` is required.  Choose a short step for undrained failure, and a long step for drained failure.
+        Rain goes on during the steps of a trial, so the pore pressures change unless the steps are short.
     rtol
         Final relative difference of the bounds, in [1e-4, 0.5].
     steps
@@ -233,11 +238,10 @@ class _Weakened:
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: the scene has contacts, must have none")
         initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data of the old grid
-        self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
         def resistance(points, u, dt):
             strain = ufl.sym(points.grad(u))
-            return viscosity / dt * ufl.inner(strain, strain) * points.dx
+            return getattr(points, CREEP) / dt * ufl.inner(strain, strain) * points.dx
 
         materials = [_as_fields(m) for m in scene.materials.materials]
         terms, sources = scene.extensions
@@ -251,17 +255,22 @@ class _Weakened:
             pressure=0.0,
             extensions=([*terms, resistance], sources),
             initial={},  # the materials already have their data for initial stresses
+            own=(CREEP,),
         )
         self._strengths, self.newton = _strengths(scene, initial.points), []
-        points = replace(initial.points, data={**initial.points.data, **self._strengths})
+        points = replace(initial.points, data={**initial.points.data, **self._strengths, CREEP: 0 * initial.points.J})
         initial = begin_stage(self._scene, replace(initial, points=points), {}, [], [], False, {})
-        self._start = self._unyielding(replace(initial, t=initial.t - dt))
-        stress, modulus = _mean_stress(self._scene, self._start.points), _shear_modulus(self._scene, self._start.points)
-        self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
+        start = self._unyielding(replace(initial, t=initial.t - dt))
+        stress = self._scene.materials.effective_stress_3d(start.points)
+        _check_stress(self._scene, start.points, stress)
+        part, self._parts = self._scene.on_grid(start.points).parts
+        data = {CREEP: self._viscosity(start.points, stress), PART: part}
+        self._start = replace(start, points=replace(start.points, data=start.points.data | data))
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
         """Return the overloads in the steps of a trial.  `tell`: receives number and overload of each step."""
-        trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
+        weaker = {name: _over(name, value, factor) for name, value in self._strengths.items()}
+        trial, out = self._trial(self._start, weaker), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
             self._go_on(trial, f"strength / {factor:g}")
@@ -272,13 +281,20 @@ class _Weakened:
     def _unyielding(self, initial: State) -> State:
         """Return the state after a step with soil that cannot yield."""
         moduli = self._scene.materials.table(initial.points, lambda m: m.oedometric)
-        trial = self._trial(initial, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
+        stronger = {name: np.maximum(own, moduli) for name, own in self._strengths.items() if name not in ANGLES}
+        trial = self._trial(initial, stronger)
         self._go_on(trial, "soil that cannot yield")
         return replace(trial.state, t=initial.t)
 
-    def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state.  `strength`: function from name and full to present value."""
-        data = {name: strength(name, value) for name, value in self._strengths.items()}
+    def _viscosity(self, points: MaterialPoints, stress: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the viscosity (n,) of each point, in Pa s, from its effective stress (n, 3, 3), in Pa."""
+        phi, pressure = np.radians(self._strengths["friction"]), -np.trace(stress, axis1=1, axis2=2) / 3
+        strength = self._strengths.get("cohesion", 0.0) * np.cos(phi) + np.maximum(pressure, 0) * np.sin(phi)
+        modulus = self._scene.materials.table(points, lambda m: m.shear)
+        return self._steps / STRAINS * np.maximum(self._least * modulus, strength) * self._dt
+
+    def _trial(self, start: State, data: Mapping[str, NDArray[np.float64]]) -> _Trial:
+        """Return a trial that starts from a state with new values of data of the points."""
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
@@ -298,10 +314,11 @@ class _Weakened:
         strain = np.pad((increment + increment.transpose(0, 2, 1)) / 2, ((0, 0), (0, 3 - d), (0, 3 - d)))
         stress = self._scene.materials.effective_stress_3d(now)[new]
         volume, size = _yielding_volume(self._scene, now)[new], partial(np.linalg.norm, axis=(1, 2))
-        viscous = 2 * float(self._viscosity.value) / self._dt * size(strain) ** 2
-        work = np.array([volume @ viscous, volume @ (size(_deviator(stress)) * size(_deviator(strain)))])
-        viscous_work, whole_work = over_all(self._scene.grid.comm, work)
-        return float(viscous_work / whole_work) if viscous_work > 0 else 0.0
+        viscous = 2 * now.data[CREEP][new] / self._dt * size(strain) ** 2
+        densities = viscous, size(_deviator(stress)) * size(_deviator(strain))
+        work = [np.bincount(now.data[PART][new], volume * density, self._parts) for density in densities]
+        viscous_work, whole_work = over_all(self._scene.grid.comm, np.array(work))
+        return float(np.divide(viscous_work, whole_work, out=np.zeros(self._parts), where=viscous_work > 0).max())
 
 
 def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -314,24 +331,15 @@ def _yielding_volume(scene: Scene, points: MaterialPoints) -> NDArray[np.float64
     return points.volume0 * points.J * scene.materials.table(points, lambda m: isinstance(m, Frictional) + 0 * m.shear)
 
 
-def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress in soil that may yield, in Pa.  Raise ValueError if it is zero."""
-    grid = scene.grid
-    size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
-    moduli, volume = scene.materials.table(points, lambda m: m.oedometric), _yielding_volume(scene, points)
+def _check_stress(scene: Scene, points: MaterialPoints, stress: NDArray[np.float64]) -> None:
+    """Raise ValueError if soil that may yield has no effective stress.  `stress` (n, 3, 3), in Pa."""
+    grid, volume = scene.grid, _yielding_volume(scene, points)
+    moduli = scene.materials.table(points, lambda m: m.oedometric)
     far = 2**grid.dim * grid.reach / grid.least  # a gradient is a sum over the corners
-    sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
-    total, rounding, whole_volume = over_all(grid.comm, sums)
+    size = np.linalg.norm(stress, axis=(1, 2))
+    total, rounding = over_all(grid.comm, np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume]))
     if not total > rounding:
         raise ValueError("factor_of_safety: the bodies have no stress, must be in equilibrium under loads")
-    return float(total / whole_volume)
-
-
-def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of the shear modulus, in Pa, over soil that may yield."""
-    softness, volume = scene.materials.table(points, lambda m: 1 / m.shear), _yielding_volume(scene, points)
-    total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, volume.sum()]))
-    return float(whole_volume / total)
 
 
 def _of(m: Skeleton) -> list[str]:

@@ -467,7 +467,9 @@ def balanced(scene: Scene, state: State) -> State:
             points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
     except StepFailed as error:
         scene.forget()
-        raise ValueError(f"initial_stress: must be in equilibrium with the loads at the start: {error}") from error
+        what = f"initial_stress: must be in equilibrium with the loads at the start: {error}"
+        hint = "if the loads may exceed the limit load, omit initial_stress or apply them in later steps"
+        raise ValueError(f"{what}; {hint}") from None
     left, count, points, held, rest, outcome = best
     _report(scene, seeded, points, count, left, any(one.touches for one in problem.loads))
     cells = np.concatenate([np.empty(0, np.int32), *(one.held_cells for one in problem.loads)])

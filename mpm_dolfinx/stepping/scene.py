@@ -70,6 +70,7 @@ class Scene:
     `extensions`: user-defined terms in the balance of momentum, and in the storage of fluid.
     `initial`: initial stresses of bodies, see `initial_stress.by_body`.
     `velocity`: initial velocity, m/s, see `Simulation`; None if bodies cannot have inertia.
+    `own`: names of more fields of the points, for user-defined terms.  The fields are zero in seeded points.
     """
 
     def __init__(
@@ -85,10 +86,11 @@ class Scene:
         extensions: tuple[Sequence[Callable], Sequence[Callable]],
         initial: Mapping[int, Any],
         velocity: ArrayLike | Callable | None = None,
+        own: Sequence[str] = (),
     ):
         self.grid = grid
         given = {"numerics": numerics, "weighs": weighs, "pressure": pressure, "extensions": extensions}
-        given |= {"initial": initial, "velocity": velocity}
+        given |= {"initial": initial, "velocity": velocity, "own": own}
         self._on = partial(Scene, bodies=bodies, materials=materials, fluid=fluid, **given)
         self.former: WeakSet[SceneMaterials] = WeakSet()
         """Materials of this scene on earlier partitions of the grid among processes."""
@@ -98,6 +100,7 @@ class Scene:
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
+        seeded = replace(seeded, data=seeded.data | {name: np.zeros(len(seeded)) for name in own})
         if velocity is not None:
             seeded = replace(seeded, data=moving(seeded, velocity, grid.base, grid.axisymmetric))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
