@@ -111,7 +111,7 @@ def test_deep_soft_soil_hardly_changes_the_factor():
     """E / (gamma H) = 66.  With rtol = 0.005, F was 1.70 on ground of depth 2 m, and 2.20 at 0.5 m."""
     shallow, deep = (mpm.factor_of_safety(cut(deep, shear=5e5), rtol=0.02).factor for deep in (0.5, 2.0))
     print(f"ground of depth 0.5 H: {shallow:.3f}, 2 H: {deep:.3f}")
-    assert deep == pytest.approx(shallow, rel=0.08)
+    assert deep == pytest.approx(shallow, rel=0.03)
 
 
 def test_a_simulation_goes_on_after_its_factor_as_before():
@@ -269,7 +269,7 @@ def test_the_factor_of_a_cut_hardly_depends_on_its_stiffness():
     shears = [ratio * weight / (18 / 7) for ratio in (50, 500, 5000)]
     soft, *firm = (mpm.factor_of_safety(bank(8, bulk=2 * G, shear=G, **clay)).factor for G in shears)
     print(f"E / (gamma H) = 50, 500, 5000: factors {soft:.2f}, {firm[0]:.2f}, {firm[1]:.2f}")
-    assert firm == pytest.approx([soft, soft], rel=0.02)
+    assert firm == pytest.approx([soft, soft], rel=0.03)
 
 
 @pytest.mark.slow
