@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Solver for both balances together, for large bodies.
 
-    [ K  -B^T ] [du]   [R_u]
-    [ B   C   ] [dp] = [R_p]
+    [ K  -B^T ] [du]     [R_u]
+    [ B   C   ] [dp] = - [R_p]
 
 K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES.  Its right
 preconditioner is the upper block triangle, with the fixed-stress operator `P = C + beta V` in place of the Schur
