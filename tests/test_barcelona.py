@@ -249,8 +249,8 @@ def test_the_tangent_has_what_stresses_change_by_with_suction(axisymmetric, othe
     s, rng = layers(axisymmetric, other), np.random.default_rng(3)
     _, momentum, storage = set_up(s, 1e-6)
     u, p = momentum.system.unknowns, storage.system.unknowns
-    u.add(momentum.forms.u, 1.0, u.gather_owned(2e-4 * rng.standard_normal(u.size)))
-    p.add(storage.forms.p, 1.0, p.gather_owned(2e4 + 1e3 * rng.standard_normal(p.size)))
+    u.add(momentum.forms.u.x, 1.0, u.gather_owned(2e-4 * rng.standard_normal(u.size)))
+    p.add(storage.forms.p.x, 1.0, p.gather_owned(2e4 + 1e3 * rng.standard_normal(p.size)))
     momentum.assemble_residual()
     momentum.assemble_tangent()
     dp, found = p.gather_owned(rng.standard_normal(p.size)), []
@@ -262,7 +262,7 @@ def test_the_tangent_has_what_stresses_change_by_with_suction(axisymmetric, othe
         found.append(-out.array)
     forces = []
     for step in (1.0, -2.0):
-        p.add(storage.forms.p, step, dp)
+        p.add(storage.forms.p.x, step, dp)
         forces.append(momentum.assemble_residual()[0].array.copy())
     forces = (forces[0] - forces[1]) / 2
     size = np.abs(forces).max()
