@@ -105,7 +105,7 @@ for iteration in range(8):
     solver.getPC().setType("lu")
     rhs, change = unknowns.gather(b, unknowns.vector()), unknowns.vector()
     solver.solve(rhs, change)
-    unknowns.add(u, -1.0, change)
+    unknowns.add(u.x, -1.0, change)
 assert size < 1e-8
 
 # 4. The points move, and the grid is reset.

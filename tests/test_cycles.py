@@ -231,7 +231,7 @@ def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the
 
     def change(d, then=0.0):
         now = replace(points, corners=X + d)
-        return filtered(grid, found, now, replace(points, corners=X + d - then), np.ones(len(points), dtype=bool))
+        return filtered(grid, found, now, grid.cells_between(X + d - then, X + d).sum(axis=2))
 
     quadratic = 0.1 * X**2 + 0.2 * X[..., ::-1] * X
     assert np.abs(change(quadratic, far)).max() < 1e-15

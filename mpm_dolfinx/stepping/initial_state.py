@@ -127,11 +127,13 @@ def begin_stage(
     """Return the state at the beginning of a stage with the new conditions `named`, see `Simulation.stage`."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
-        raise ValueError("gravity: the scene has none; to change it, a scene must be created with gravity=(0, 0)")
+        raise ValueError("gravity: the scene has none; for changes, Simulation(gravity=(0, 0)) must create it")
     if "inertia" in named:
         flag("stage: inertia", named["inertia"])
         if scene.momentum.inertia is None:
-            raise ValueError("stage: inertia: the scene has none; to change it, a scene must be created with inertia=False")
+            raise ValueError(
+                "stage: inertia: the scene has none; for changes, Simulation(inertia=False) must create it"
+            )
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are still to be added")
     flag("stage: reset_displacement", reset_displacement)
