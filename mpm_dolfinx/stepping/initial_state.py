@@ -127,13 +127,11 @@ def begin_stage(
     """Return the state at the beginning of a stage with the new conditions `named`, see `Simulation.stage`."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
-        raise ValueError("gravity: the scene has none; for changes, Simulation(gravity=(0, 0)) must create it")
+        raise ValueError("gravity: the scene has none, must be created with gravity=(0, 0)")
     if "inertia" in named:
         flag("stage: inertia", named["inertia"])
         if scene.momentum.inertia is None:
-            raise ValueError(
-                "stage: inertia: the scene has none; for changes, Simulation(inertia=False) must create it"
-            )
+            raise ValueError("stage: inertia: the scene has none, must be created with inertia=False")
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are still to be added")
     flag("stage: reset_displacement", reset_displacement)
