@@ -24,7 +24,7 @@ the yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The eq
 also at isotropic stress and at the critical state, where a = 0.
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
-The stress then jumps, or the equation for d has no solution and the time step is reduced.
+Then either the stress jumps, or the equation for d has no solution and the time step is reduced.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ class ModifiedCamClay(Skeleton):
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
         in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.  For bodies
-        with an `initial_stress` of the scene, such as `K0`, the stress of the scene replaces these stresses, and any
-        values with a mean < 0 have the same results.
+        with an `initial_stress` of the scene, such as `K0`, the stress of the scene replaces these stresses.  Then all
+        values with a mean < 0 give the same results.
     OCR
         Overconsolidation ratio, -, >= 1: initial size P_c of the yield surface, divided by the size of the yield
         surface that passes through the initial stress.
@@ -168,7 +168,7 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def trial(F, prestretch, plastic):
-        """Return the trial elastic strain, its trace e_v, and 2/3 e : e with its deviator e."""
+        """Return the trial elastic strain, its trace e_v, and the product 2/3 e : e of its deviator e."""
         strain = Trial(F, plastic, prestretch)
         e = strain.deviatoric
         return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
@@ -213,7 +213,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return `function`, a method of Modified Cam Clay, with lambda and P_c at the present suction."""
+    """Return a function that calls `function`, a method of Cam Clay, with lambda and P_c at the present suction."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -244,7 +244,7 @@ def _dried(function: Callable) -> Callable:
 class BarcelonaBasic(ModifiedCamClay):
     """Modified Cam Clay with a yield surface that grows with suction, for soil that collapses on wetting.
 
-    P_c is the size of the yield surface in Bishop's stress at the suction s = max(-p, 0), with the pore pressure p.
+    P_c is the size of the yield surface in Bishop's stress at the suction s = max(-p, 0), where p is the pore pressure.
     P_c0 is the size of the yield surface in saturated soil.  The loading-collapse curve of the Barcelona Basic Model is
 
         P_c / P_r = (P_c0 / P_r)^((lambda(0) - kappa) / (lambda(s) - kappa)),

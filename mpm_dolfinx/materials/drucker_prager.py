@@ -55,9 +55,9 @@ class DruckerPrager(Frictional):
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.
     match
         Stress states in which the cone coincides with the Mohr-Coulomb yield surface.  "plane strain" gives the
-        collapse load of the Mohr-Coulomb law in plane strain, exactly for associated flow.  "compression" is the outer
-        cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no cone
-        fits all stress states: a circular footing bears 10 % less with von Mises's law than with Tresca's.
+        collapse load of the Mohr-Coulomb law in plane strain; this load is exact for associated flow.  "compression" is
+        the outer cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry
+        no cone fits all stress states: a circular footing bears 10 % less with von Mises's law than with Tresca's.
 
     Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),
@@ -97,7 +97,7 @@ class DruckerPrager(Frictional):
 
     @property
     def eta_flow(self):
-        """Coefficient of the pressure in the plastic potential: eta for the dilation angle."""
+        """Coefficient of the pressure in the plastic potential: eta, computed with the dilation angle."""
         return self._cone(self.dilation)[0]
 
     @staticmethod

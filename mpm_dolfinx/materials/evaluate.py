@@ -278,7 +278,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces.  With `laws`, they have the fields F, position, conductivity and porosity0.
+        Integration points of the pieces.  If `laws` is not empty, they have F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -342,7 +342,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return a law's conductivities in three states of deformation, which checkpoints store."""
+    """Return a law's conductivities in three states of deformation, to be stored in checkpoints."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

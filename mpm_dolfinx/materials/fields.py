@@ -131,7 +131,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """For checkpoints: checksums of constants that vary, and samples of conductivity laws and retention curves."""
+        """For checkpoints: checksums of varying constants, and samples of conductivity laws and retention curves."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -264,7 +264,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return (n, 2): conductivity in m/s, and a number that identifies conductivity law and retention curve."""
+        """Return (n, 2): conductivity in m/s, and one number for both the conductivity law and the retention curve."""
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
@@ -275,13 +275,13 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's retention curve, counted from 1, or 0 if its pores stay saturated."""
+        """Return the index of each point's retention curve, counted from 1, or 0 if the pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return S, dS/dp, Bishop's chi and k_r at pressures p, in Pa, for the points with the indices `of`."""
+        """Return saturation S, dS/dp, Bishop's chi and relative permeability at pressures p, in Pa, for points `of`."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -296,7 +296,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return `saturation` at the pressures p, in Pa.  `rows`: a row of `retention_rows` for each pressure."""
+        """Return the results of `saturation` at p, in Pa.  `rows`: a row of `retention_rows` for each pressure."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:

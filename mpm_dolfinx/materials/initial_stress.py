@@ -237,7 +237,7 @@ def _in_columns(
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return the points with target stresses (n, 3, 3), in Pa, at the chosen points.  All processes must call this.
+    """Return all points, with the target stresses (n, 3, 3), in Pa, at the chosen ones.  All processes must call this.
 
     In Modified Cam Clay the initial stress is a parameter.  In other laws, elastic strains cause the initial stress.
     ValueError is raised if a target stress is outside the yield surface.
@@ -336,7 +336,7 @@ class _ElasticStrains:
         return np.clip(strain - change, -1, 1)
 
     def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return the points with elastic strains, and a mask (n,) of points whose stress differs from the target."""
+        """Return the points with the elastic strains found, and a mask (n,) of points that miss the target stress."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         close = SAME * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains

@@ -282,7 +282,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    `system`: function of point indices (r,) and their y (r, m) that returns f, df/dy and the norms of f.
+    `system`: function of point indices (r,) and of y (r, m) at these points, which returns f, df/dy and the norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
@@ -338,7 +338,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Divide the components of a UFL vector among tensors, and return these by name."""
+    """Divide the components of a UFL vector among tensors, and return the tensors by name."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

@@ -25,14 +25,14 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X contains the points of one process only.  The value at a point must not depend on other points, as a mean would.
+X contains the points of one process only.  The value at a point must not depend on other points, such as their mean.
 """
 
 BY_SCENE = ("dt", "cell_size")
 """Arguments that laws receive from the scene: the time since the start of the step, s, and the cell size, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""State variables that the scene sets: the suction max(-p, 0), Pa, at the end of a substep and at seeding."""
+"""State variables that the scene sets: suction max(-p, 0), Pa, at the end of a substep, and suction at seeding."""
 
 LOCKING = 0.43
 """Poisson's ratio nu above which cells use F-bar, which doubles the run time of a step.
@@ -45,7 +45,7 @@ nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar.
 """
 
 SEPARATION = 1e-4
-"""Relative difference added to equal eigenvalues, for finite derivatives.  Sensitivity (scene "beam" of
+"""Relative difference added to equal eigenvalues, so that derivatives are finite.  Sensitivity (scene "beam" of
 tests/plateaus.py): half this value changes the result by 1.8e-09, and twice this value by 7.2e-09.  Finer cells change
 it by 1.5e-02.
 """
@@ -105,12 +105,12 @@ class Skeleton:
         Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  The function
         takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
-        may also be a function without arguments that returns the array, called only for a tangent.  A missing
+        may also be a function without arguments that returns the array; only a tangent needs its call.  A missing
         derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  Newton's method
         for the balances is slow if the derivative of `energy` with respect to the unknowns is not zero.
     trial
         Function of F that returns trial values as UFL, by name.  Residuals depend on F only through these values.
-        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` get trial values that are not UFL.
+        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` get trial values other than UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     If a law receives the new state and dt = 0, it must return the stress at the end of the step.  The argument
@@ -125,7 +125,7 @@ class Skeleton:
     Raises
     ------
     ValueError
-        A constant is out of its range.  The scene raises ValueError for invalid fields, names, shapes and functions.
+        A constant is out of its range.  `Simulation` raises ValueError for invalid fields, names, shapes and functions.
 
     Examples
     --------
@@ -162,7 +162,7 @@ class Skeleton:
     elastic_hencky: ClassVar[bool] = False
     """Whether Hencky's law relates stresses and elastic strains."""
     linear: ClassVar[bool] = False
-    """Whether the stress is linear in F, so that factors of the stiffness matrix can be reused."""
+    """Whether the stress is linear in F, so that the factorised stiffness matrix can be reused."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
     """The names `dt` and `cell_size`, if they are arguments of the law's functions."""
@@ -308,8 +308,8 @@ class Skeleton:
 
         For laws with a state, tau is half of the value for macroelements of 2 x 2 cells, 3 alpha^2 / (8 (lambda + 3G))
         (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  For other laws tau is a quarter of the value for
-        macroelements, which improves conditioning and smears pressures less. In 3D tau is the same as in 2D: the value
-        for 2 x 2 x 2 cells is too small for pressures that alternate along two axes.
+        macroelements, which improves conditioning.  The factor one half would smooth pressures more.  In 3D tau is the
+        same as in 2D: the value for 2 x 2 x 2 cells is too small for pressures that alternate along two axes.
         """
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * self.macroelement)
 

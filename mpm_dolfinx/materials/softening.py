@@ -38,8 +38,8 @@ class SofteningDruckerPrager(DruckerPrager):
     residual
         Residual cohesion c_r, Pa, in [0, cohesion]; c_r = c_0 means no softening.
     slip
-        Slip s along a shear band, m, > 0, at which the cohesion has fallen to c_r.  The scene raises ValueError if soil
-        in cells too large for s would soften faster than it unloads elastically.
+        Slip s along a shear band, m, > 0, at which the cohesion has fallen to c_r.  `Simulation` raises ValueError if
+        cells are so large that soil would soften faster than it unloads elastically.
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
