@@ -41,7 +41,7 @@ class Contact:
     Raises
     ------
     ValueError
-        A value is invalid.  A scene also raises this error if two groups share a body, or have no common `Contact`.
+        A value is invalid.  `Simulation` also raises this error if two groups share a body, or lack a common `Contact`.
     """
 
     one: int | Sequence[int]

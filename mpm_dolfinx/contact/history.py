@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points.  They store means of the pressures `push` and tractions `shear` of their contact pairs."""
+        """Return the points with the means, over their contact pairs, of pressures `push` and tractions `shear`."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -60,7 +60,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Merge two `Origin`: the pairs that `kept` flags.  Return the result, and the new order of the pairs (n,)."""
+    """Merge the pairs that `kept` flags in two `Origin`.  Return the result, and the new order of the pairs (n,)."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

@@ -168,7 +168,7 @@ class MovedTools(ContactProblem):
         return np.hstack([force, (across(found.at.arm) * force).sum(axis=1, keepdims=True)])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return upper bounds of the absolute contributions that `_onto` returns."""
+        """Return upper bounds of the absolute values of the contributions that `_onto` returns."""
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
@@ -194,7 +194,7 @@ class MovedTools(ContactProblem):
         return np.clip((motion * e).sum(axis=1, keepdims=True), -h, h) * e
 
     def _bearing_displacement(self, found: Found) -> NDArray[np.float64]:
-        """Return the displacement of each tool (k,), in m, at which a pair first bears its load, or infinity."""
+        """Return the displacement of each tool (k,), in m, at which a first pair bears the tool's load, or infinity."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)

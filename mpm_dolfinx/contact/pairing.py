@@ -164,7 +164,7 @@ class Contacts(Touching):
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return numbers `first * grid.all_cells + second` of the pairs of cells that may be in contact in the step."""
+        """Return `first * grid.all_cells + second` for each pair of cells that may be in contact in the step."""
         grid = self.grid
         keys = []
         count = self.grid.all_cells
@@ -234,7 +234,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether each corner (n, 2^d) after the step is nearer than `BESIDE` cells to another group."""
+        """For each corner (n, 2^d), return whether it is within `BESIDE` cells of another group after the step."""
         present = replace(points, corners=corners)
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])

@@ -60,7 +60,7 @@ class Pairs:
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest absolute coordinates from which gaps are computed, in m."""
+        """Largest absolute value, in m, of the coordinates from which gaps are computed."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:

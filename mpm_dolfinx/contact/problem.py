@@ -97,7 +97,7 @@ class ContactProblem(Loads):
     again
         Function that finds the pairs at nodal displacements (local array, in m), and returns `law` and `origin`.
     cell_pairs
-        Function that returns numbers `first * grid.all_cells + second` of all pairs of cells that may be in contact.
+        Function that returns `first * grid.all_cells + second` for each pair of cells that may be in contact.
     """
 
     linear, smooth, touches = False, False, True
@@ -309,7 +309,7 @@ class ContactProblem(Loads):
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """See `Loads`.  Each contact has an array of forces (N) and moments (N m) on bodies: (3,) in 2D, (6,) in 3D."""
         found, where = self.found(at), self.found(at).at
-        if self.pairs.other_side() is not None:  # lever arms at present: moments of a body at rest sum to zero
+        if self.pairs.other_side() is not None:  # present lever arms, so that moments on a body at rest sum to zero
             where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
         return {"tool_forces": dict(zip(self.now.law.names, self.now.law.forces(found.touch, where), strict=True))}
 
@@ -343,7 +343,7 @@ class ContactProblem(Loads):
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Merge two `Pairs`, or two `ContactState`: the entries that `kept` flags, sorted by `order`."""
+    """Merge the entries that `kept` flags in two `Pairs`, or in two `ContactState`, and sort them by `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

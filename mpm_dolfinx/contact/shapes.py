@@ -230,8 +230,8 @@ class Cone(Placed):
     axis : (d,)
         Direction from the tip into the tool, of any length.
     angle_deg
-        Angle between axis and flank, half the apex angle, in degrees, between 0 and 90.  The cone of a CPT has 30
-        degrees.
+        Angle between axis and flank, half the apex angle, in degrees, between 0 and 90.  It is 30 degrees for the cone
+        of a cone penetration test.
     """
 
     tip: ArrayLike

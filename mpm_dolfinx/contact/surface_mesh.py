@@ -84,7 +84,7 @@ class Facets:
         return ((y - self._columns[0][0].take(at, 1)) * self._normal.take(at, 1)).sum(axis=0)
 
     def _from_sides(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-        """Return the nearest points to y on the sides: coordinates from 0 to 1 (d, m), and vectors to y (d, d, m)."""
+        """For the points on sides nearest to y, return coordinates from 0 to 1 (d, m), and vectors to y (d, d, m)."""
         corners, _, along = (of.take(at, 2) for of in self._columns)
         offset = y - corners
         share = np.clip((offset * along).sum(axis=1) / self._squares.take(at, 1), 0, 1)

@@ -48,7 +48,7 @@ def motion_count(dim: int) -> int:
 
 
 def _outwards(tool: Tool, y: NDArray[np.float64], depth: NDArray[np.float64], h: float) -> NDArray[np.float64]:
-    """Return motions (n, d), in m, of positions y (n, d) out of a tool by their depths (n, 1) along the normal.
+    """Return motions (n, d), in m, that move positions y (n, d) out of a tool by `depth` (n, 1) along the normal.
 
     If the normal varies within the depth, its mean replaces it.  The result is continuous at edges and axes.
     """
@@ -121,7 +121,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at the end of a substep.  With inertia, the first substep uses `in_step`."""
+        """Return the pose of a tool at the end of a substep; with inertia, `in_step` changes the pose."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -160,7 +160,7 @@ class Tools(Touching):
         return self._motions(place.before, "tool_travel", "tool_rotation")
 
     def _motions(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return the results `along` (such as displacements) and `around` (rotations) of all tools (tools, q)."""
+        """Return an array (tools, q) of the results `along` (such as displacements) and `around` (rotations)."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d)))
         for row, name, tool in zip(out, self.names, self.tools, strict=True):
@@ -177,7 +177,7 @@ class Tools(Touching):
         return MovedToolLoads(tools, place, moved=moved) if moved.guides.any() else ToolLoads(tools, place)
 
     def _moved(self, place: Place) -> Moved:
-        """Return mass, motion and load of tools that forces move.  None moves while an initial stress is balanced."""
+        """Return mass, motion and load of tools that forces move.  In the balancing of an initial stress, none move."""
         d, q = self.grid.dim, motion_count(self.grid.dim)
         of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
         moves = [tool in of and tool.free == place.inertia for tool in self.tools]
@@ -278,7 +278,7 @@ class Tools(Touching):
                 warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
 
     def warn_missed(self, place: Place, points: MaterialPoints) -> None:
-        """Warn of tools without contact, if a tip or corner moves deeper into a body than all positions near it."""
+        """Warn if a tip or corner of a tool without contact is deeper in a body than all surface positions near it."""
         grid, patches = self.grid, place.cut.surface(self.outside)
         for name, tool in zip(self.names, self.tools, strict=True):
             touches = over_all(grid.comm, int((points.data[pressure_name(name)] > 0).any()))
