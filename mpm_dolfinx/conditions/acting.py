@@ -40,9 +40,9 @@ QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_tr
 OF_RAIN = ("rain", "runoff", "ran_off", "ponded")
 """Names of the results that only scenes with rain have."""
 VOLUMES = {"outflows": "flowed", "rain": "rained"}
-"""Names of the volumes since the start of the conditions, by the names of their rates."""
+"""Names of the integrals of rates over the time since the start of a condition, keyed by the name of the rate."""
 IMPULSES = {"reactions": "impulse", "tool_forces": "impulse", "wall_reactions": "wall_impulse"}
-"""Names of the impulses since the start of the conditions, by the names of the forces.  Bodies have inertia."""
+"""Names of the integrals of forces over this time, keyed by the name of the force; only with inertia."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 """Names of the results that only free tools have."""
 
@@ -56,7 +56,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)`.  The first call for each class `make` compiles them."""
+        """Return the forms `make(grid, u, *more)`.  The first call for each class `make` compiles the forms."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -298,7 +298,7 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners (n, 2^d, d), in m, of re-initialised domains: prisms at sides with prescribed displacement.
+        """Return corners (n, 2^d, d), in m, of re-initialised domains.  At prescribed displacements, they form prisms.
 
         `ids` (n,): identifiers of the points.
         `tracked`: corners before the re-initialisation from F; `corners`: corners after it.
@@ -314,7 +314,7 @@ class Loads:
 
 
 def defined(loads: Sequence[Loads], *names: str) -> dict[str, list[Callable]]:
-    """Return by name the methods that loads define.  Methods of the class `Loads` add nothing, and are left out."""
+    """Return the methods that loads define, by name.  Methods of the class `Loads` add nothing, and are left out."""
     found = {name: [] for name in names}
     for one in loads:
         for name, methods in found.items():

@@ -72,7 +72,7 @@ class Traction(Condition):
     Raises
     ------
     ValueError
-        No body has this side, or the value is invalid.  The scene or a step raises the error.
+        No body has this side, or the value is invalid.  `Simulation`, `stage` or a step raises the error.
     """
 
     side: str
@@ -140,9 +140,9 @@ class Quiet(Condition):
     Raises
     ------
     ValueError
-        The scene raises the error.  The bodies have no inertia, or had inertia before the side became quiet.  No body
-        has this side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a face.  A wall
-        of the grid fixes the side.  Gravity changes at the start of the stage.
+        `Simulation` or `stage` raises the error.  The bodies have no inertia, or had inertia before the side became
+        quiet.  No body has this side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a
+        face.  A wall of the grid fixes the side.  Gravity changes at the start of the stage.
     """
 
     side: str
@@ -174,7 +174,7 @@ class OnSide(Condition):
     Raises
     ------
     ValueError
-        The function is invalid, or no body has this side.  The scene raises the error.
+        The function is invalid, or no body has this side.  `Simulation` raises the error, not this constructor.
     """
 
     side: str
@@ -317,9 +317,9 @@ class Rain(Flux):
     is possible.
 
     `Simulation.outflows` contains the flow through the side, and `outcome("runoff")` the run-off, in m^3/s (m^2/s in
-    plane strain).  These outcomes are volumes since the start of the condition, in m^3 (m^2 in plane strain): "flowed"
-    (outflow), "rained" (rain), "ran_off" (run-off and seepage), and "ponded" (the pond).  "rained" plus "flowed" equals
-    "ran_off" plus "ponded".
+    plane strain).  These outcomes are accumulated volumes since the start of the condition, in m^3 (m^2 in plane
+    strain): "flowed" (outflow), "rained" (rain), "ran_off" (run-off and seepage), and "ponded" (the pond).  "rained"
+    plus "flowed" equals "ran_off" plus "ponded".
 
     Parameters
     ----------
@@ -375,7 +375,7 @@ class Tied(Condition):
     ------
     ValueError
         The sides are not opposite, or their faces differ.  Another `Tied`, a `Quiet`, `Drained`, `Inflow` or `Rain` is
-        on the same part of a face.  The scene raises the error.
+        on the same part of a face.  `Simulation` or `stage` raises the error.
     """
 
     side: str
@@ -430,8 +430,8 @@ class Displacement(Condition):
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement at reference positions X (m, d), since the start, or since a stage set displacements to zero.  The
-        value has d components, even if only some of them are prescribed.
+        Displacement at reference positions X (m, d), since the start of the run, or since a stage set displacements to
+        zero.  The value has d components, even if only some of them are prescribed.
     components
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m
@@ -442,8 +442,8 @@ class Displacement(Condition):
     ------
     ValueError
         No body has this side, or `value` or `components` is invalid.  A wall fixes a component whose value is not 0.
-        Another `Displacement` prescribes this component on the same part of a face, or at a common edge with another
-        value.  The scene or a step raises the error.
+        Another `Displacement` prescribes this component on the same part of a face, or, with another value, at a common
+        edge.  `Simulation`, `stage` or a step raises the error.
     """
 
     side: str
@@ -493,7 +493,7 @@ class RigidPlate(Condition):
     ------
     ValueError
         The force is not finite, or no body has this side.  The faces are not connected or not coplanar; define one
-        plate, with a region, for each part.  The scene or a step raises the error.
+        plate, with a region, for each part.  `Simulation`, `stage` or a step raises the error.
     """
 
     side: str
