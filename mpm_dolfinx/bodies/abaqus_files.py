@@ -23,7 +23,7 @@ SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\d
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
 """Pattern of the names of line elements.  Group 1 of a match is the number of nodes, group 2 the order of a beam."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
-"""Name prefixes of elements without volume or area."""
+"""Prefixes of the names of elements without volume or area."""
 KINDS = {
     **{("plane", 3): "triangle", ("plane", 4): "quad", ("plane", 6): "triangle6", ("plane", 8): "quad8"},
     **{("plane", 9): "quad9", ("solid", 4): "tetra", ("solid", 5): "pyramid", ("solid", 6): "wedge"},
@@ -276,7 +276,7 @@ def _unique(
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return the cells of instances, element sets and surfaces in each block of cells, by name."""
+    """For each name of an instance, element set or surface, return its cells in each block of cells."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [[k for k, of in one.scope.sets.items() if not (of.internal and k.startswith("_"))] for one in placed]
     for k, one in enumerate(placed):

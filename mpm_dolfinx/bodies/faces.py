@@ -249,7 +249,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide parts of faces into triangles, and clip these to a region.  Return each triangle, and its part's index."""
+    """Divide parts of faces into triangles, and clip these to a region.  Return triangles, and their parts' indices."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -265,7 +265,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the face and the corners of each part of a face without contact.  Triangles repeat a corner."""
+    """Return the face and the corners of each part without contact.  Triangles repeat a corner."""
     on = [covers(own, other) for other in others]
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)

@@ -42,7 +42,7 @@ def polygon(
     sides
         Name of the edge from each corner to the next, or "" for no name.  A single name applies to all edges.
     holes : name -> (k, 2), m
-        Corners of each hole, such as a tunnel.  The boundary of a hole is one side, named by the key.
+        Corners of each hole, such as a tunnel.  The boundary of a hole is one side with the name of the hole.
     size
         Edge length of the quadrilaterals, m.  By default the cell size divided by `per_cell`.
     per_cell, material

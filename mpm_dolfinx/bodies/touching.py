@@ -98,7 +98,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return pairs of polytopes a (k, c, d) and b (l, c, d) with bounding boxes nearer than `distance`, in m."""
+    """Return pairs of one of the polytopes a (k, c, d) and one of b (l, c, d), with boxes within `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -200,7 +200,7 @@ def uncovered_triangles(
         has = count[owner] > k
         free, whose = [s[:, :, ~has]], [owner[~has]]
         s, owner = s[:, :, has], owner[has]
-        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # corners around the face
+        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # corners in circular order
         orientation = np.sign(cross_in_plane(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
         for a in range(4):
             p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
@@ -340,7 +340,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest gap, in m, between a and b along any of the given normals."""
+    """Return the largest of the gaps, in m, between a and b along the given normals."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -382,7 +382,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap (m) of two bodies, their smallest gap (cells), and the position; overlap or gap is 0.
+    """Return the largest overlap (m) of two bodies, their smallest gap (cells; one of both is 0), and the position.
 
     `a`, `b`: results of `solids` for both bodies.
     `in_cells`: function that divides positions by the cell size.
