@@ -47,7 +47,7 @@ def box_mesh(
         Global indices of the nodes of this process's cells.  In the order of the nodes of a cell, the first coordinate
         varies fastest.
     x : (m, d), m
-        Positions of the nodes that this process adds.  Nodes of lower ranks have lower global indices.
+        Positions of the mesh nodes that this process contributes.  Nodes of lower ranks have lower global indices.
     ranks, offsets
         `ranks[offsets[i] : offsets[i + 1]]` contains the owner of cell i, then the ranks where this cell is a ghost.
     """
@@ -231,7 +231,7 @@ class CompiledForm:
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix of the form to `A`, with one row for each component of a node.  The caller must assemble `A`.
+        """Add the form's matrix to `A`, which has one row for each component of a node.  The caller must assemble `A`.
 
         `rows`: values of the coefficients, one row for each entity, by default from `packed()`.
         """

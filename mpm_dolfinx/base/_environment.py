@@ -39,8 +39,8 @@ def _check() -> None:
 
     if np.issubdtype(PETSc.ScalarType, np.complexfloating):
         raise ImportError(
-            "PETSc has complex numbers, but mpm_dolfinx needs real ones: on Debian, PETSC_DIR unset or ending in "
-            "-real and `apt install python3-dolfinx-real`, elsewhere `conda install -c conda-forge 'petsc=*=real*'`"
+            "PETSc has complex numbers, but mpm_dolfinx needs real ones: on Debian, PETSC_DIR must be unset or end in "
+            "-real: `apt install python3-dolfinx-real`; elsewhere `conda install -c conda-forge 'petsc=*=real*'`"
         )
     root, show = logging.getLogger(), warnings.showwarning
     level, handlers = root.level, root.handlers[:]

@@ -80,7 +80,7 @@ def density_between(p0, p1, compliance):
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the numbers (n,) of `density_between` for arrays (n,) of pressures, in Pa.  `bulk` is K_w, in Pa."""
+    """Return `density_between` as numbers (n,), for pressures p0 and p1 (n,), in Pa.  `bulk` is K_w, in Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

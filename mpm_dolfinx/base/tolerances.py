@@ -25,8 +25,8 @@ NEAR = 8 * float(np.finfo(np.float32).eps)
 Source: epsilon of single precision (IEEE 754), as in mesh files, times 8 for a few operations.
 """
 TINY = float(np.finfo(float).tiny) / EPSILON
-"""Lower bound of a divisor, or a term added to it.  Quotients with a numerator below (1 / epsilon) are then finite.
-Source: IEEE 754.
+"""Lower bound of a divisor, or term added to a divisor.  Quotients with a numerator below (1 / epsilon) are then
+finite.  Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2
 """Very long time step, in s: a change by (1 / epsilon) in it has only the rate epsilon.  Source: epsilon squared."""

@@ -187,7 +187,7 @@ class _Arguments(NamedTuple):
 
     parameters: tuple[str, ...]  # names of the parameters that receive arguments
     names: tuple[str, ...] | None  # see `takes`
-    alone: Mapping[str, str]  # parameters that are keywords only, and their names among t, X and x
+    alone: Mapping[str, str]  # keyword-only parameters, and their names among t, X and x
     positional: tuple[str, ...]  # names among t, X and x of the other parameters, in their order
 
 
