@@ -29,4 +29,4 @@ TINY = float(np.finfo(float).tiny) / EPSILON
 finite.  Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2
-"""Very long time step, in s: a change by (1 / epsilon) in it has only the rate epsilon.  Source: epsilon squared."""
+"""Very long time step, in s: changes by (1 / epsilon) then have only the rate epsilon.  Source: epsilon squared."""

@@ -138,7 +138,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the largest distance (n,), in m, between each chosen domain's edges and its mapped reference edges."""
+        """Return the largest distance (n,), in m, of each chosen domain's edges from the images of reference edges."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out

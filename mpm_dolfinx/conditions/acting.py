@@ -40,9 +40,9 @@ QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_tr
 OF_RAIN = ("rain", "runoff", "ran_off", "ponded")
 """Names of the results that only scenes with rain have."""
 VOLUMES = {"outflows": "flowed", "rain": "rained"}
-"""Names of the integrals of rates over the time since the start of a condition, keyed by the name of the rate."""
+"""Names of the time integrals of rates (volumes) since the start of a condition, by the name of the rate."""
 IMPULSES = {"reactions": "impulse", "tool_forces": "impulse", "wall_reactions": "wall_impulse"}
-"""Names of the integrals of forces over this time, keyed by the name of the force; only with inertia."""
+"""With inertia: names of the time integrals of forces since the start of a condition, by the name of the force."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 """Names of the results that only free tools have."""
 
@@ -278,7 +278,7 @@ class Loads:
         return points
 
     def ended(self, at: At) -> Loads:
-        """Return the loads at the end of the step."""
+        """Return these loads, with the state that they have at the end of the step."""
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:

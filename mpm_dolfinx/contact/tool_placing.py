@@ -38,7 +38,7 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners of the bounding box of x, each with the MPI operation over all processes."""
+    """Return both corners of the bounding box of x, each with the MPI operation that combines it over all processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 

@@ -310,7 +310,7 @@ class SceneMaterials:
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
     def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the field `retention` of the points, see `Retentions`."""
+        """Return the index and the constants of each point's retention curve (n, ...), see `Retentions.row`."""
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:

@@ -36,8 +36,8 @@ class K0:
     are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial and circumferential.
     The stresses are exact for level ground with level layers.  In other ground, the stresses are changed until they
     balance the weight, without motion of the points.  A warning is given if balancing changes a stress by more than 5 %
-    of the largest initial stress, as on slopes.  Another warning is given if the pore pressure exceeds the overburden,
-    for example below open water without a surcharge.
+    of the largest initial stress, for example on slopes.  Another warning is given if the pore pressure exceeds the
+    overburden, for example below open water without a surcharge.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ This y has the right value and the right derivative with respect to F.  UFL's de
 consistent tangent, although the forms contain no iterations.  The points store y*, z* and Y as coefficients.
 
 If the law has an energy, the tangent is the second derivative of the energy, and the expression for y has a
-second-order term.  A law in numpy computes y(z) and dy/dz itself.
+second-order term.  If a law has a numpy function `solution`, this function computes y(z) and dy/dz.
 """
 
 from __future__ import annotations
