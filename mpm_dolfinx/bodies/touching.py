@@ -98,7 +98,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return pairs of one of the polytopes a (k, c, d) and one of b (l, c, d), with boxes within `distance`, in m."""
+    """Return pairs of polytopes, of a (k, c, d) and of b (l, c, d), with bounding boxes within `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))

@@ -40,7 +40,7 @@ QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_tr
 OF_RAIN = ("rain", "runoff", "ran_off", "ponded")
 """Names of the results that only scenes with rain have."""
 VOLUMES = {"outflows": "flowed", "rain": "rained"}
-"""Names of the time integrals of rates (volumes) since the start of a condition, by the name of the rate."""
+"""Names of the volumes that are time integrals of rates since the start of a condition, by the name of the rate."""
 IMPULSES = {"reactions": "impulse", "tool_forces": "impulse", "wall_reactions": "wall_impulse"}
 """With inertia: names of the time integrals of forces since the start of a condition, by the name of the force."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")

@@ -177,7 +177,7 @@ class Tools(Touching):
         return MovedToolLoads(tools, place, moved=moved) if moved.guides.any() else ToolLoads(tools, place)
 
     def _moved(self, place: Place) -> Moved:
-        """Return mass, motion and load of tools that forces move.  In the balancing of an initial stress, none move."""
+        """Return mass, motion and load of tools that forces move; none move while an initial stress is balanced."""
         d, q = self.grid.dim, motion_count(self.grid.dim)
         of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
         moves = [tool in of and tool.free == place.inertia for tool in self.tools]

@@ -25,7 +25,7 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X contains the points of one process only.  The value at a point must not depend on other points, such as their mean.
+X contains the points of one process only.  The value at a point must not depend on other points: do not use means.
 """
 
 BY_SCENE = ("dt", "cell_size")
@@ -105,7 +105,7 @@ class Skeleton:
         Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  The function
         takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
-        may also be a function without arguments that returns the array; only a tangent needs its call.  A missing
+        may also be a function without arguments that returns the array; it is called only for a tangent.  A missing
         derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  Newton's method
         for the balances is slow if the derivative of `energy` with respect to the unknowns is not zero.
     trial
