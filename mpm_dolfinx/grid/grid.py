@@ -143,7 +143,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the range index (n,), and the value (n,), of all integers in the ranges `first` to `first + count - 1`."""
+    """Return range index (n,) and value (n,) of each integer in the ranges `first` to `first + count - 1`."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -158,7 +158,7 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def distinct(numbers: NDArray[np.integer], count: int) -> tuple[NDArray[np.integer], NDArray[np.intp]]:
     """Return the distinct numbers (k,), ascending, and the index (n,) of each of the n numbers among them.
 
-    `count`: number above all `numbers`, which are at least 0.
+    `count`: upper limit, with 0 <= `numbers` < `count`.
     """
     if count > numbers.size:
         return np.unique(numbers.ravel(), return_inverse=True)
@@ -855,7 +855,7 @@ class Grid:
         return np.where(bits, self.signs / (self._h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) in the order of `monomials` to coefficients for offsets in m."""
+        """Convert coefficients (d, 2^d, cells) for offsets as in `monomials` to coefficients for offsets in m."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]
