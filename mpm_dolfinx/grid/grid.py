@@ -69,7 +69,7 @@ FACES = {d: _faces(d) for d in (2, 3)}
 """Corner indices (2d, 2^(d-1)) of the faces of a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
 """Sign (6,) of the normal that follows from the order of the corners in `FACES`, for each face: 1 if this normal points
-outward, and -1 if inward.  In 2D, only the first four apply.
+outward, and -1 if inward.  In 2D, only the first four signs apply.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles that divide a face in 3D symmetrically.  Each triangle has two corners of the face and its middle."""

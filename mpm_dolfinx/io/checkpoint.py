@@ -434,7 +434,7 @@ def _before(file: Path, of: dict[str, Member], row: int) -> int:
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
-    """Return the arrays without numbered rows, the positions of all other arrays in the file, and the metadata."""
+    """Return the arrays without row numbers, the positions of all other arrays in the file, and the metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN

@@ -105,7 +105,7 @@ class HeldCells:
     Attributes
     ----------
     number, cell
-        Index of the condition of each penalty, and its local cell.
+        Index of the condition, and local cell, of each penalty.
     x, shape, moments
         Of each penalty, `x`: position (m), `shape`: shape functions, `moments`: products of offsets from the cell's
         midpoint.  For a penalty on a mean, these values are means over the side too.

@@ -77,7 +77,7 @@ class Safety:
     overloads
         Dictionary from the factor of each trial to the overloads (n,) in its n steps.  The overload of a step is the
         work of the viscous stress, divided by the work of the shear stress, in soil that may yield.  If the bodies have
-        several connected parts, it is the largest overload of a part.
+        several connected parts, the largest overload of a part counts.
     newton
         Number of Newton steps of all trials.
     """
