@@ -23,7 +23,7 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, divided by the cell size, without a new cut of the domains.
+"""Largest motion of corners, divided by the cell size, up to which the domains are not cut again.
 
 In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load, and the
 settlement by the fraction 3e-5.  Sensitivity (scene "strip" of tests/plateaus.py): half this value changes the result
@@ -205,7 +205,7 @@ class CutDomains(Keyed):
         return self.surfaces([faces])[0]
 
     def contact_surface(self, faces: Surface) -> Patches:
-        """Return quadrature points on a surface in contact.  In 3D, corners within `NEAR` cells of a plane lie on it.
+        """Return quadrature points of a contact surface.  In 3D, corners within `NEAR` cells of a plane count as on it.
 
         If a plane cut off a tiny corner of a triangle, all points on the triangle would move.  The contact of a sharp
         tool would then change by a finite amount.  In 2D, points on an edge change continuously.
@@ -296,12 +296,12 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic index (n,) of the cell at x (n, d), in m, in the domain of each point `at` (n,)."""
+        """Return lexicographic indices (n,) of the cells of positions x (n, d), in m, in the domains of points `at`."""
         # rounding must not assign a corner on a grid line to a cell outside the domain
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x, or of the largest piece if the domain has no piece in the cell of x."""
+        """Return the cell of each position x, or the cell of the largest piece if the domain has no piece there."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

@@ -103,7 +103,7 @@ class SeededDomains:
         return seeded
 
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
-        """Return the row numbers (n,) of domains along an axis, from the middle of the body; nan without a lattice."""
+        """Return row numbers (n,) of domains along an axis, counted from the body's middle; nan without a lattice."""
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
             at, count = places[:, 0] == i, self.bodies[i].lattice[axis]

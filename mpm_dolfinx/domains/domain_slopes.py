@@ -7,8 +7,8 @@ domain, the gradient is therefore
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume).
 
-The sum is over the axes a.  The slopes D_a are a least-squares fit to the gradients F of neighbours of the same
-material across faces.  The fit reproduces linear fields on any mesh.  The reference volume of the domain is conserved.
+The sum is over the axes a.  The slopes D_a are a least-squares fit to F of the neighbours of the same material that
+share a face.  The fit reproduces linear fields on any mesh.  The reference volume of the domain is conserved.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index for values and face centres of neighbours, and which neighbours exist.
+        """Return a function of a face index.  It gives values and face centres of neighbours, and whether they exist.
 
         `own` (c, k): c values of each of k points.
         `faces`: centres (d, k), in m, of the faces of the points, for each face index.
@@ -135,7 +135,7 @@ def _faces_of_parts(
 
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of the other row that is identical to each row of keys, or -1 without such a row."""
+    """Return the index of the partner of each row of keys: another, identical row.  Rows without a partner have -1."""
     order, out = np.lexsort(key.T), np.full(len(key), -1)
     same = np.logical_and.reduce(key[order[1:]] == key[order[:-1]], axis=1).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]

@@ -35,7 +35,7 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction (at most 1) of a wave with a length of two domains that the filter removes, per crossed cell.
+"""Fraction (at most 1) that the filter removes, per crossed cell, of a wave with a length of two domains.
 
 Sensitivity (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, and twice this value
 by 3.4e-04. Finer cells change it by 6.2e-03.
@@ -149,7 +149,7 @@ def _at_sites(
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """Return values at lattice sites of this process, its layers, and a function that copies site values to corners.
+    """Return site values and layers (a slice) of this process, and a function that copies site values to corners.
 
     The layers of the lattice are distributed over the processes.  A site has the mean value of its corners, or nan if a
     value differs from the mean by more than `tolerance`.

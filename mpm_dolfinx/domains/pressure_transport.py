@@ -139,7 +139,7 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return pressure differences and slopes at both cell ends, and which ends have neighbours or drained sides."""
+        """Return pressure differences, slopes, masks of neighbours and of drained sides, for both ends of each cell."""
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
         axis, end = np.arange(self.grid.dim)[:, None], np.arange(2)
@@ -196,7 +196,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factor (n,) <= 1 on the increments of each cell that keeps them within [`low`, `high`]."""
+    """Return one factor (n,) <= 1 for each cell: the largest with which its increments are within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -242,7 +242,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the largest factor on the correction of each piece that keeps the pressures of its domain in bounds."""
+    """Return a factor <= 1 (m,) for each correction: the largest with which its domain's pressures are in bounds."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)

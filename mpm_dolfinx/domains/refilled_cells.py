@@ -36,7 +36,7 @@ Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the res
 CRUMB = NEAR
 """Largest area of a removed part of a domain, divided by the area of its cell.
 
-Other parts of the domain receive the mass and the seeded faces of a removed part.  Source: `NEAR`.
+The remaining parts of the domain receive the mass and the seeded faces of a removed part.  Source: `NEAR`.
 """
 SMALL = (0.5 / EDGES) ** 2
 """Cells in which a part of an old domain has less than this fraction of the cell area are renewed too.
@@ -437,7 +437,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, by least squares."""
+        """Return slopes (n, 2, k), in units of `values` per m, of least-squares fits in the cells of n new domains."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
 
@@ -458,7 +458,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Indices of pieces of removed domains, receiving groups of new domains, and fractions of the old mass."""
+        """Indices of pieces of removed domains, the groups of new domains that receive them, and mass fractions."""
         pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, outside])

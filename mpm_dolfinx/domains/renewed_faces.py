@@ -99,7 +99,7 @@ def faces_of_parts(
 
 
 def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
-    """Return a surface with the added faces of divided domains, and the index of each face in the given surface.
+    """Return the surface plus faces of divided domains, and for each face the index of its origin in `faces`.
 
     Polygons of the given surface must be rectangles in local coordinates.
     """

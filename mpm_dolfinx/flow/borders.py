@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes in unsaturated soil through faces of cells with several soils, and faces between cells of different soil.
+"""Fluxes in unsaturated soil: through faces of cells with several soils, and between cells of different soil.
 
 `series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL (`fluxes`).
 """
@@ -124,7 +124,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices (k,) of open faces of owned mixed cells, and `Relative.through_sides` for these faces."""
+        """Yield indices (k,) of open faces of owned mixed cells, and the results of `Relative.through_sides` there."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -140,7 +140,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the flow paths, with the values of ghost cells from other processes."""
+        """Return the flow paths, in which ghost cells have the values of their owners."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
@@ -198,7 +198,7 @@ class BorderFlows:
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the derivatives of the outflows with respect to the pressures to an unassembled matrix."""
+        """Add the derivatives of the outflows to a matrix (with respect to the pressures), without final assembly."""
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

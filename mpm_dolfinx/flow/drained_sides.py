@@ -67,7 +67,7 @@ class DrainedSides(Feeding):
         return [faces for _, faces in self._outlets]
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return placeholders before the first step: `value` for rates, and zero for volumes."""
+        """Return placeholders for the results before the first step: `value` for rates, and zero for volumes."""
         out = {"outflows": {name: np.array(value) for name in self._names}}
         rains = [name for name, rain in zip(self._names, self._rains, strict=True) if rain]
         start = {"rain": value, "runoff": value, "ran_off": 0.0, "ponded": 0.0} if rains else {}
@@ -179,7 +179,7 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the relative conductivities of the faces, and the derivatives of the fluxes."""
+        """Return both results of `Relative.through_sides`: k_r (m,) of the faces, and the derivative (m,)."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
@@ -187,8 +187,8 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """Faces on all open sides.  This class replaces `OpenFaces` if at least one side has rain.
 
-    Through a face with rain, the outflow is minus the rain, between two bounds: the outflow at the pressure of the
-    pond, and the outflow at the pressure `Rain.driest`.
+    The outflow through a face with rain is minus the rain, but limited by two bounds.  The bounds are the outflows at
+    the pressure of the pond and at the pressure `Rain.driest`.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -246,7 +246,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the open sides with the inflow from ponds as additional rain, and the largest volumes of the ponds."""
+        """Return open sides, whose rain includes the inflow from ponds, and the largest volume (m^d) of each pond."""
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))
@@ -263,7 +263,7 @@ class SideFeeds(Feeds):
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
     def conducting(self, flow: Conduction, driest: NDArray[np.float64] | None = None) -> OpenFaces:
-        """Return the faces with their conductances.  `driest` (m,), Pa: pressure outside in place of the pond's."""
+        """Return the faces with their conductances.  `driest` (m,), Pa: replaces `sides.pressure`."""
         at, sides = self._at, self.sides if driest is None else replace(self.sides, pressure=driest)
         (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
         faces = OpenFaces(at, conductance, inflow, self._seeps, offset)
@@ -306,7 +306,7 @@ class SideFeeds(Feeds):
         return changes
 
     def outcome(self, at: OpenFaces, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outflow through the sides of each condition, and with rain the rain and the run-off, in m^d/s.
+        """Return the outflow through the sides of each condition, in m^d/s; for `Rain` also the rain and the run-off.
 
         Run-off is rain that neither infiltrates nor fills a pond.
         """
@@ -328,7 +328,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, now: Mapping[str, Mapping[str, NDArray[np.float64]]]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the ponded water, and the total of run-off and seepage from sides with rain, in m^d."""
+        """Return two volumes (m^d) for each condition with rain: ponded water, and the sum of run-off and seepage."""
         if self.linear:
             return {}
         out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "ran_off": {}}
@@ -340,7 +340,7 @@ class SideFeeds(Feeds):
         return out
 
     def _if_open(self, at: OpenFaces, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of the faces, with zeros at closed seepage faces."""
+        """Return the `values` (m,) of the faces, set to zero at closed seepage faces."""
         return np.where(self._flows | ~at.seeps, values, 0.0) if self.settles else values
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:

@@ -72,7 +72,7 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return the argument `at` of the methods below, which depends on conductivities and the motion of cells."""
+        """Return the argument `at` of the methods below.  It depends on conductivities and on the motion of cells."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Start a substep.
@@ -93,7 +93,7 @@ class Feeds:
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
-        """Return the derivatives of the outflow that `slope` omits, with respect to cell pressures, or None if zero."""
+        """Return a matrix: derivatives of outflows with respect to cell pressures, without `slope`; None if zero."""
 
     def settle(self, at: Any, fluid: Fluid) -> int:
         """Update the active set, and return the number of changes on this process."""
@@ -108,9 +108,9 @@ class Feeds:
     def volumes(
         self, now: Mapping[str, Mapping[str, NDArray[np.float64]]]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return further volumes (m^d) at the end of a step, by quantity and condition.
+        """Return volumes (m^d) at the end of a step, in addition to `outcome`, by quantity and condition.
 
-        `now`: results of all conditions at the end of the step.  They contain the time integrals `acting.VOLUMES`.
+        `now`: results of all conditions at the end of the step, including the time integrals `acting.VOLUMES`.
         """
         return {}
 

@@ -100,7 +100,7 @@ class Conduction(NamedTuple):
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return ratios (m,): face distance from the centroid, divided by that from the pressure position (`layers`).
+        """Return distances (m,) of faces from the centroid, divided by distances from the pressure position (`layers`).
 
         `normal` (m, d): normals of the faces.
         `offset` (m, d), m: vectors from the centroids to the faces.
@@ -530,7 +530,7 @@ class FluxForms:
         return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
-        """Set the coefficients for the conductivities of cells.  Return the mobilities (n, d) along the axes."""
+        """Set the coefficients that depend on conductivities of cells.  Return the mobilities (n, d) along the axes."""
         d = self.grid.dim
         filled = contents.filled
         shift = flow.mobility.shift

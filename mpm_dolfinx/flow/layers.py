@@ -133,7 +133,7 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes, and shifts of pressure positions from centroids, divided by the cell size.
+        """Return mobilities along the axes, and shifts, in cell sizes, from centroids to pressure positions.
 
         `mean`: 1 if all layers shift the pressure position, 0 if only inclined layers shift it.
         """
@@ -214,7 +214,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return factors (n,) on the shifts of `_along`: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
+        """Return factors (n,) for the shifts in `_along`: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,7 +233,7 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return mobilities (n, d) along the axes, divided by `mean`, if the mobility varies gradually in each cell.
+    """Return mobilities (n, d) along the axes, divided by `mean`, of cells in which the mobility varies gradually.
 
     The mean over the cell is harmonic along the gradient of the mobility, and arithmetic normal to this gradient.
 

@@ -140,7 +140,7 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the pressure gradients minus the unit weight of the fluid (rows, d), in Pa/m.
+        """Return the pressure gradients (k, d) in the k cells `rows`, minus the unit weight of the fluid, in Pa/m.
 
         `p` (c,), Pa: pressures of all local cells.
         `outer` (m,), Pa: pressures outside the open sides.
@@ -212,5 +212,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return vectors along faces: from the centroid, projected onto the face, to the centre of the face."""
+    """Return vectors along faces: from the cell's centroid, projected onto the face, to the centre of the face."""
     return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

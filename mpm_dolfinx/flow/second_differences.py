@@ -7,7 +7,7 @@ The damping matrix H is defined by sums over cells and axes for all pressures p 
 
 Here w is the weight of a cell and axis, and h is the edge length of the cell along the axis.  The neighbours along the
 axis have the pressures p_+ and p_-.  Their centroids have the distances d_+ and d_- from the centroid of the cell.  The
-term of a cell and axis is omitted if material covers no part of one of the two faces normal to the axis.
+term of a cell and axis is omitted if one of the two faces normal to the axis has no material.
 
 A uniform gradient is not damped.  The sum of H p over the cells is zero, so damping conserves fluid.
 """

@@ -151,7 +151,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return the values of `Through`, as rows (3, faces): conductance, then both slopes."""
+        """Return the fields of `Through` as three rows (3, faces): the conductance, then both entries of `slopes`."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)
@@ -194,7 +194,7 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (faces, segments) of the segments in series."""
+        """Select the `values` of segments in series, and return them as an array (faces, segments)."""
         starts = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
@@ -235,7 +235,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the conductance and slopes of two segments in series."""
+    """Return the conductance and both slopes of two segments in series, see `Through`."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

@@ -273,7 +273,7 @@ class StorageSystem:
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of the local unknowns, and an empty array, because no pressure is prescribed."""
+        """Return the grid positions of local unknowns and of prescribed pressures; the second array is always empty."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
@@ -321,7 +321,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def set_by_motion(self, dt: float, filled: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
-        """Set the matrix B to the derivative (m^(d-1)) of the outflow due to inertia with respect to displacements.
+        """Set the matrix B to the derivative (m^(d-1)), with respect to displacements, of the outflow due to inertia.
 
         `dt`, s: time weight of the outflow.
         `rows` (n, k), m^(d-1)/s: derivative of the outflow through open sides with respect to the nodal displacements,
@@ -351,10 +351,10 @@ class StorageSystem:
 
 
 class StorageResidual(NamedTuple):
-    """Residuals of the fluid balance in the cells, and sums (parts,) over the cells of each connected part, in m^d."""
+    """Residuals of the fluid balance in the cells, with sums (parts,) of terms over each connected part, in m^d."""
 
     vector: PETSc.Vec
-    exchanged: NDArray[np.float64]  # sum of absolute changes of content and of sources
+    exchanged: NDArray[np.float64]  # sum of absolute values: changes of content, and sources
     round_off: NDArray[np.float64]  # sum of the bounds of rounding errors
     off: NDArray[np.float64]  # sum of absolute mass errors of the cells
     gain: NDArray[np.float64]  # change of content plus outflow minus sources
@@ -364,7 +364,7 @@ class StorageResidual(NamedTuple):
 class FluidInertia(NamedTuple):
     """Inertia in a substep, in the n active owned cells."""
 
-    move: Callable[[], None]  # sets the acceleration in the forms to that at u
+    move: Callable[[], None]  # sets the acceleration in the forms to its value at u
     forces: Callable[[NDArray[np.int64] | slice], NDArray[np.float64]]  # see `Fluid.force`
     resists: NDArray[np.float64]  # (n,) see `OnGrid.resisting_mass`
     density: float  # of the fluid, kg/m^3
@@ -379,7 +379,7 @@ class StorageProblem:
     `dt`: time weight, s, of the outflow rate at (u, p).
     `before`: contribution of the previous substep's rates to the outflow volumes.
     `softness` (m,): ratio of elastic to tangent shear modulus of the pieces, 1 if no law can yield.
-    `defect` (n,), m^d: correction of volume defects in the active owned cells by the end of the substep.
+    `defect` (n,), m^d: volume defect that is corrected until the end of the substep, in each active owned cell.
     `inertial`: inertia of the bodies, or None.
     `scale`: suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
     """
@@ -465,7 +465,7 @@ class StorageProblem:
         return out
 
     def volumes(self, now: Mapping[str, Mapping]) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return further volumes at the end of a step, by quantity and name, see `Feeds.volumes`."""
+        """Return the additional volumes (m^d) at the end of a step, by quantity and name, see `Feeds.volumes`."""
         out: dict[str, dict[str, NDArray[np.float64]]] = {}
         for one in self._feeds:
             for quantity, values in one.volumes(now).items():
@@ -488,7 +488,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return water content errors due to pressure errors (Pa), and absolute water content changes in the step."""
+        """Return errors of the water content due to `error` in pressures (Pa), and its absolute changes in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume

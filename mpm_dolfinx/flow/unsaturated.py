@@ -53,7 +53,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
 
     `p`: pressures on both sides, Pa.
     `tables`: three values on each side: integral of k_r (Pa), k_r, and derivative of k_r (1/Pa).
-    `drop`: pressure drop from the first side to the second due to the weight of the fluid, Pa.
+    `drop`: pressure drop due to the weight of the fluid, from the first side to the second, Pa.
     `scale`: characteristic suction of k_r, Pa.
     `of`: elementary functions of arrays or of UFL expressions.
     """
@@ -187,7 +187,7 @@ class Relative:
         `normal` (m, d): normals of the sides.
         `p` (m,), Pa: pressures in the cells.
         `outer` (m,), Pa: pressures outside the sides.
-        `drop` (m,), Pa: pressure drop from the centroid to the face due to the weight of the fluid.
+        `drop` (m,), Pa: pressure drop due to the weight of the fluid, from the centroid to the face.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()
@@ -202,7 +202,7 @@ class Relative:
         return k, np.maximum(derivative, 0.0)
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
-        """Set `shares` in the filled owned cells to fractions (n, count)."""
+        """Set the coefficient `shares` in the filled owned cells to the given fractions (n, count)."""
         self.shares.x.array[:] = 0.0
         self.shares.x.array.reshape(-1, self.count)[filled] = shares
         self.shares.x.scatter_forward()

@@ -69,7 +69,7 @@ FACES = {d: _faces(d) for d in (2, 3)}
 """Corner indices (2d, 2^(d-1)) of the faces of a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
 """Sign (6,) of the normal that follows from the order of the corners in `FACES`, for each face: 1 if this normal points
-outward, and -1 if inward.  In 2D, only the first four apply.
+outward, and -1 if inward.  In 2D, only the first four signs apply.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles that divide a face in 3D symmetrically.  Each triangle has two corners of the face and its middle."""
@@ -143,7 +143,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the range index (n,), and the value (n,), of all integers in the ranges `first` to `first + count - 1`."""
+    """Return range index (n,) and value (n,) of each integer in the ranges `first` to `first + count - 1`."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -158,7 +158,7 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def distinct(numbers: NDArray[np.integer], count: int) -> tuple[NDArray[np.integer], NDArray[np.intp]]:
     """Return the distinct numbers (k,), ascending, and the index (n,) of each of the n numbers among them.
 
-    `count`: number above all `numbers`, which are at least 0.
+    `count`: upper limit, with 0 <= `numbers` < `count`.
     """
     if count > numbers.size:
         return np.unique(numbers.ravel(), return_inverse=True)
@@ -855,7 +855,7 @@ class Grid:
         return np.where(bits, self.signs / (self._h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) in the order of `monomials` to coefficients for offsets in m."""
+        """Convert coefficients (d, 2^d, cells) for offsets as in `monomials` to coefficients for offsets in m."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]

@@ -134,7 +134,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return one list of the ranks that have each cell, owner first, and the position in it at which each cell begins.
+    """Return one list of all ranks that have each cell (owner first), and the index where the ranks of each cell begin.
 
     `cells` (n,): lexicographic indices.  A cell is a ghost on the processes that own its neighbours across faces.
     """

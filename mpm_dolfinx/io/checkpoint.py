@@ -43,7 +43,7 @@ FORMAT, VERSION = "mpm_dolfinx checkpoint", 17  # Source: the format of the file
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 POINTS, PIECES = "points/id", "pieces/id"
-# first part of the names of arrays that are stored by rows -> name of the array that numbers these rows
+# first part of the names of arrays that are stored by rows -> name of the array with their row numbers
 NUMBERED = {"points/": POINTS, "stay/": POINTS, "trend/rates": POINTS, "pieces/": PIECES}
 NUMBERED |= {f"{name}/": f"{name}/node" for name in NODAL}
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
@@ -403,12 +403,12 @@ def _complete(file: Path) -> Iterator[None]:
 
 
 def _numbered(name: str) -> str | None:
-    """Return the name of the array that numbers the rows of the array `name`, or None if the rows have no numbers."""
+    """Return the name of the array with the row numbers (ids) of the array `name`, or None if there is none."""
     return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return the rows (start, stop) of each array to read here.  Raise ValueError if row numbers are invalid."""
+    """Return the rows (start, stop) that this process reads, by array.  Raise ValueError if row numbers are invalid."""
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
         first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))
@@ -416,7 +416,7 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
             first, last = (_before(file, of, row) for row in out[POINTS])
         numbers = some_rows(file, of[name], first, min(last + 1, of[name].shape[0]))
         if (np.diff(numbers) < (name != PIECES)).any():
-            raise ValueError(f"{name}: numbers of rows must ascend")
+            raise ValueError(f"{name}: row numbers must ascend")
         out[name] = first, last
     for name, member in of.items():
         if member.shape[0] != of[_numbered(name)].shape[0]:
@@ -425,7 +425,7 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
 
 
 def _before(file: Path, of: dict[str, Member], row: int) -> int:
-    """Return the number of pieces of all points that are stored before the point in row `row`."""
+    """Return the number of pieces that belong to the points stored before row `row`."""
     points, pieces = of[POINTS], of[PIECES]
     if row == points.shape[0]:
         return pieces.shape[0]
@@ -434,7 +434,7 @@ def _before(file: Path, of: dict[str, Member], row: int) -> int:
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
-    """Return the arrays without numbered rows, the positions of all other arrays in the file, and the metadata."""
+    """Return the arrays without row numbers, the positions of all other arrays in the file, and the metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN

@@ -37,7 +37,7 @@ YIELDING = 0.02
 Finer cells change it by 8.9e-02.
 """
 RATIO = 0.3
-"""Ratio of the volume fractions of two cells below which their common face has a penalty.
+"""If the ratio of the volume fractions of two cells is below this value, their common face has a penalty.
 
 Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the result by 1.3e-03, and twice this value by
 5.9e-04. Finer cells change it by 3.0e-02.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides, by penalties (`held_cells`).
 
-If a side lags behind its prescribed displacement, each component in each cell gets a multiplier (method of multipliers,
-Hestenes 1969).
+If a side lags behind its prescribed displacement, each prescribed component in each cell gets a multiplier (method of
+multipliers, Hestenes 1969).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the component along `direction` of a Q1 field w, as a mean over an area with the given moments."""
+            """Return the component of a Q1 field w along `direction`: its mean over an area with the moments in `h`."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
@@ -101,7 +101,7 @@ class GivenDisplacements(Acting):
             jump = over_all(self._grid.comm, float(np.abs(jump).max(initial=0.0)), MPI.MAX)
             if jump:
                 what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move; %s"
-                why = "values count from the start or the last reset_displacement, must begin at the present position"
+                why = "its values refer to the start or the last reset_displacement, must begin at the present position"
                 self._warn(number, what, jump, place.start, why)
 
     def _jump(
@@ -109,7 +109,7 @@ class GivenDisplacements(Acting):
     ) -> NDArray[np.float64]:
         """Return the gaps (n, d), in m, between a side and its prescribed positions at the start of a stage.
 
-        Gaps that the elastic strain of a cell explains are zero in the result.
+        The result is zero for gaps that the elastic strain of a cell explains.
         """
         out = np.zeros_like(p.now(points))
         if not place.begins:
@@ -145,7 +145,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides.  `ends`: start and end of the step, in s; empty if equal."""
+        """Return the integration points on sides.  `ends`: start and end of the step, in s; empty if dt = 0."""
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
         rows, bounds = [], []
@@ -236,7 +236,7 @@ class GivenDisplacements(Acting):
             share = over_all(self._grid.comm, float(share), MPI.MAX)
             if -np.inf < share < 0.5:  # less than half of the increment
                 what = f"{line(hold)}: the bodies follow at most {max(0.0, share):.0%} of the prescribed increment"
-                raise CannotFollow(f"{what}, must be free to move; undrained pores keep their water")
+                raise CannotFollow(f"{what}, must be free to move; undrained soil keeps its volume")
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
@@ -251,11 +251,11 @@ class GivenDisplacements(Acting):
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
             held = np.flatnonzero(np.isin(ids, faces.id))
-            number = faces.face[np.searchsorted(faces.id, ids[held])]  # if a domain has two held faces, the first
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # only the first held face of a domain
             axis, end = (k[:, None] for k in np.divmod(number, 2))
             outward = face_vectors(tracked[held], number)
             depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
-            face = index ^ ((index >> axis & 1 ^ end) << axis)  # for each corner, the corner opposite on the held face
+            face = index ^ ((index >> axis & 1 ^ end) << axis)  # for each corner, its partner on the held face
             there = np.take_along_axis(tracked[held], face[:, :, None], axis=1)
             corners[held] = there - np.where((face != index)[:, :, None], depth[:, None], 0.0)
         return corners
@@ -352,7 +352,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return dofs and penalty forces.  Forces at wall nodes are not reactions of walls, see `Loads.counted`."""
+        """Return local dofs and their penalty forces, which are not reactions of walls, see `Loads.counted`."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

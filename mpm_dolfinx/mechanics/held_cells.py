@@ -25,7 +25,7 @@ from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side relative to a grid axis at which the side has a stiff penalty at each point. Sensitivity
+"""A side has a stiff penalty at each point if its slope relative to a grid axis is at most this value.  Sensitivity
 (scene "held" of tests/plateaus.py): half this value changes the result by 0.0e+00, and twice this value by 1.4e-05.
 Finer cells change it by 4.0e-03.
 """
@@ -52,7 +52,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; until `undrained`, values of the last reset
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; fields up to `undrained`: at the last reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     confined: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
@@ -105,7 +105,7 @@ class HeldCells:
     Attributes
     ----------
     number, cell
-        Index of the condition of each penalty, and its local cell.
+        Index of the condition, and local cell, of each penalty.
     x, shape, moments
         Of each penalty, `x`: position (m), `shape`: shape functions, `moments`: products of offsets from the cell's
         midpoint.  For a penalty on a mean, these values are means over the side too.

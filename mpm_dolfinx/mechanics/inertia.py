@@ -135,8 +135,8 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
     """Return F~ - I and F F~^-1 for a midpoint rule in which rotations cause no strain.
 
     The deformation gradients at the start, midpoint and end of the step are F_n, F = F_n + D and F_n + 2 D.
-    The mean of C = F^T F at start and end is F^T F + D^T D, with F at the midpoint.  Laws are evaluated at F~, with
-    nearly this mean, and P is the first Piola-Kirchhoff stress:
+    The mean of the right Cauchy-Green tensors at the start and at the end is F^T F + D^T D.  Laws are evaluated at F~,
+    for which F~^T F~ is nearly this mean.  P is the first Piola-Kirchhoff stress:
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 

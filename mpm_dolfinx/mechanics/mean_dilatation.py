@@ -206,7 +206,7 @@ class MeanDilatation:
         self._ratios((self._key(data), motion), ratios)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
-        """Set f in each cell to a mean over the pieces with F-bar.
+        """Set f in each cell to its volume-weighted mean over the pieces with F-bar.
 
         `sums`: for each law, the integrals (cells, 1) of f over the pieces in each cell.
         """
@@ -231,7 +231,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: tuple) -> None:
-        """Scale the gradients Delta of pieces with F-bar to the volume ratios of their cells."""
+        """Scale the gradients `delta` of pieces with F-bar: their determinants become the cells' volume ratios."""
         self._set_ratios(data, motion)
         for number in self.numbers:
             rows = data.rows[number]
@@ -267,7 +267,7 @@ def _dev(tau, F):
 
 
 class Cells:
-    """The cells with pieces that use F-bar, and the indices of the cells of each law."""
+    """The cells with pieces that use F-bar (`filled`), and the indices in `filled` of the cells of each law."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))

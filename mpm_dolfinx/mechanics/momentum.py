@@ -536,7 +536,7 @@ class MomentumProblem:
 
     @cached_property
     def _rounding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rounding errors at the unknowns, and the least force scales, see `out_of_balance`, in N."""
+        """Rounding errors at the unknowns, and lower bounds of the force scales in `out_of_balance`, in N."""
         system, parts = self.system, self.system.of_parts
         more = 0.0
         for one in self.loads:

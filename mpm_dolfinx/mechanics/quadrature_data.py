@@ -22,11 +22,11 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""In dry bodies, the volume ratio from corners of domains has the weight min(1, `STIFF_DRY` G / (lambda + 2G)).
+"""Value of (lambda + 2G) / G above which the weight of the volume ratio from corners decreases in dry bodies.
 
 The volume ratio at the start of a step is a weighted mean of two values: from the corners of domains (`cell_ratios`),
-and from F of the points.  With nu = 0.4999 and a weight of 1, the stress change at a reset of the grid would exceed the
-stresses in the bodies.
+and from F of the points.  The first has the weight min(1, `STIFF_DRY` G / (lambda + 2G)).  With nu = 0.4999 and a
+weight of 1, the stress change at a reset of the grid would exceed the stresses in the bodies.
 """
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the weight of the volume ratio from corners decreases in wet bodies.

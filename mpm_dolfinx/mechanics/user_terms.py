@@ -109,7 +109,7 @@ class OwnLoads(Loads):
             term.form.assemble_vector(b, data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the derivatives of the terms at u."""
+        """Add the derivatives of the nodal forces with respect to u."""
         for term, data in self._terms:
             if term.slope is not None:
                 term.slope.assemble_matrix(K, data)

@@ -208,7 +208,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return probe, position, head and weight of each face between cells of the fit and cells outside the fit."""
+        """Return arrays for faces between cells in and outside the fit: index of probe, position, head, weight."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -227,7 +227,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return probe, position, head and weight of each drained side of a cell, and whether this cell has the probe.
+        """Return arrays for drained sides: index of probe, position, head, weight, whether the cell has the probe.
 
         Positions and heads are means over all drained faces on the side.
         """

@@ -67,7 +67,7 @@ def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> 
     missing = np.flatnonzero(over_all(comm, found) == 0)
     if len(missing):
         what = f"probe at {probes.x0[missing[0]]}: its domain was renewed in a run without this probe"
-        raise ValueError(f"{what}; all runs must have the probe, or leave out Numerics(renewal=True)")
+        raise ValueError(f"{what}; all runs must use this probe, or omit Numerics(renewal=True)")
 
 
 def _same(a: Body, b: Body) -> bool:

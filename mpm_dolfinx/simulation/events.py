@@ -121,7 +121,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the user's functions.  If one fails, all processes raise an error."""
+        """Return the values of the user's functions.  If one fails on any process, all processes raise an error."""
         s, comm = self._simulation, self._simulation.scene.grid.comm
         out = by_user(comm, "until: a function", lambda: [_number(k, of(s)) for k, of in enumerate(self._until)])
         check_alike(comm, {f"until: function {k}": value for k, value in enumerate(out)})

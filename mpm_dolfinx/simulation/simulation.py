@@ -243,9 +243,9 @@ class Simulation:
         """Return one quantity, such as "reactions", at the end of the last step, for each condition by its name.
 
         User-defined conditions are included.  The dictionary is empty if no condition of the stage has this quantity.
-        Time integrals since the start of a condition have the weights of the time integration.  "flowed" is the volume
-        of outflow, in m^3 (m^2 in plane strain).  With inertia, "impulse" is the integral of the forces `reactions` and
-        `tool_forces`, and "wall_impulse" of `wall_reactions`, in N s (N s/m in plane strain).
+        Time integrals begin at the start of a condition, and use the weights of the time integration.  "flowed" is the
+        integral of the outflow, in m^3 (m^2 in plane strain).  With inertia, "impulse" is the integral of the forces
+        `reactions` and `tool_forces`, and "wall_impulse" of `wall_reactions`, in N s (N s/m in plane strain).
 
         Raises
         ------

@@ -48,7 +48,7 @@ SDIRK2 overshoots a jump by at most 0.21 times the jump.
 AGAIN = 2.0
 """A pressure change is a jump only if its rate exceeds this factor times the rate at the start of the last step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals.  Source: exact; `SAME` times a shorter interval is below rounding errors of t."""
+"""Largest number of output intervals.  Source: exact; `SAME` times t / `MOST` is the rounding error of t."""
 RESOLVED = 10
 """Smallest `rtol`, divided by the solver's tolerance.  If `rtol` is smaller, errors of the solver dominate."""
 FIRST = 1e-3
@@ -144,7 +144,7 @@ class StepSize:
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
         factor = self._factor(report, control, 0.5)
         if factor >= 1:
-            # a step as long as a failed step mostly fails again, in a test in yielding soil 78 times instead of once
+            # a step as long as a failed step mostly fails again: in a test 78 times, with this rule once
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
             return min(max(size * factor, control.small), self.longest)  # an output time may have shortened the step
         return size * factor

@@ -55,7 +55,7 @@ Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the r
 by 0.0e+00. Finer cells change it by 3.8e-02.
 """
 STRAINS = 2.0
-"""Shear strain of a trial that barely slides, divided by the minimum of its overload and the elastic strain at yield.
+"""Shear strain of a trial that barely slides, divided by the smaller of two values: overload, elastic strain at yield.
 
 Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value
 by 8.2e-03.  Finer cells change it by 3.8e-02.
@@ -77,7 +77,7 @@ class Safety:
     overloads
         Dictionary from the factor of each trial to the overloads (n,) in its n steps.  The overload of a step is the
         work of the viscous stress, divided by the work of the shear stress, in soil that may yield.  If the bodies have
-        several connected parts, it is the largest overload of a part.
+        several connected parts, the largest overload of a part counts.
     newton
         Number of Newton steps of all trials.
     """
@@ -97,9 +97,9 @@ def factor_of_safety(
 ) -> Safety:
     """Return the factor of safety: the largest number by which the strength can be divided before the bodies fail.
 
-    The simulation does not change.  Bodies that are not in equilibrium need no earlier run.  Suction contributes to the
-    strength through the effective stress.  The factor does not divide the friction of tools.  The result depends on
-    `rtol` if only a thin weak layer at the surface slides.  All processes must call this function.
+    The simulation does not change.  No earlier `run` is necessary, even if the bodies are not in equilibrium.  Suction
+    contributes to the strength through the effective stress.  The factor does not divide the friction of tools.  The
+    result depends on `rtol` if only a thin weak layer at the surface slides.  All processes must call this function.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ class _Weakened:
         self._start = replace(start, points=replace(start.points, data=start.points.data | data))
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overloads in the steps of a trial.  `tell`: receives number and overload of each step."""
+        """Return the overloads in the steps of a trial.  `tell`: is called with number and overload of each step."""
         weaker = {name: _over(name, value, factor) for name, value in self._strengths.items()}
         trial, out = self._trial(self._start, weaker), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
@@ -294,7 +294,7 @@ class _Weakened:
         return self._steps / STRAINS * np.maximum(self._least * modulus, strength) * self._dt
 
     def _trial(self, start: State, data: Mapping[str, NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state with new values of data of the points."""
+        """Return a trial that starts from the state `start`, but with the new values `data` of point data."""
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
@@ -363,7 +363,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the values of strengths at the points, by name.  Materials without a strength have zeros."""
+    """Return the values of strengths at the points, by name.  Points without a strength have zeros."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

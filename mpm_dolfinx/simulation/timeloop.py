@@ -236,7 +236,7 @@ def _histories(
     # an interrupted run may have stopped between two outputs
     if control.interval != times.interval or not last <= now <= times.next(last):
         what = f"dt = {times.interval!r} from t = {now!r}: the run that is continued has dt = {control.interval!r}"
-        raise ValueError(f"{what}, t = {last!r}; for other steps or t_eval, leave out after: histories then begin anew")
+        raise ValueError(f"{what}, t = {last!r}; for other steps or t_eval, run without `after` (new histories)")
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
         raise ValueError(f"probes: {count} probes, must be {recorded}, as in the run that is continued")
