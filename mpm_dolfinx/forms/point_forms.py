@@ -38,7 +38,7 @@ from mpm_dolfinx.grid.grid import Grid, distinct, in_chunks, sum_by
 
 BATCH, MANY = 2**10, 2**12
 """`BATCH`: number of points in a batch of element matrices, which fits into the processor's cache.  `MANY`: number of
-points in one evaluation of an expression.  If fewer than `MANY` points remain, each evaluation takes `BATCH`.
+points in one evaluation of an expression.  If fewer than `MANY` points remain, each evaluation takes `BATCH` points.
 """
 
 
@@ -57,7 +57,7 @@ class FormPoints:
     """UFL coefficients for quantities at the points.  `PointData` contains their values.
 
     `grid`: background grid.
-    `fields`: shape of each quantity, by name.  The attribute of this name is the coefficient.
+    `fields`: shape of each quantity, by name.  The coefficient of a quantity is the attribute of this name.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):

@@ -109,7 +109,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
     """Return the PETSc matrix with the given rows and number of columns on this process.
 
-    `own`: whether `rows` has local column indices, and not global ones.
+    `own`: whether the column indices of `rows` are local; otherwise they are global.
     """
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0

@@ -143,7 +143,7 @@ def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Call `action` on rank 0, and return its result on every process.  If it fails, all raise its error."""
+    """Call `action` on rank 0, and return its result on every process.  If `action` fails, all raise its error."""
     return comm.bcast(together(comm, lambda: action() if comm.rank == 0 else None))
 
 

@@ -197,8 +197,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. In the dictionary, keys
-    are names of point data. Values are ids of points, and the tractions at these points.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. The keys of the
+    dictionary are names of point data. Each value has the ids of points, and the tractions at them.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -361,7 +361,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that points of added bodies lack. Raise ValueError if `fields` lacks such data."""
+    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks any of these data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"

@@ -74,7 +74,7 @@ class Space:
     """Space of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
     `old`: w at the start of the step.
-    `past`: part of the change of w in the step that the rate of the previous substep causes.
+    `past`: contribution of the previous substep's rate to the change of w in the step.
     `b`, `f`: residual and loads.
     `same`: copy of w that derivatives of forms treat as a constant.
     `u`, `p`: displacement and scaled pressure, the parts of w.
