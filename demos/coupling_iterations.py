@@ -208,7 +208,7 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
 
 
 def roughness(p: NDArray[np.float64]) -> float:
-    """Return the rms difference between pressures (nx, ny) and means of neighbours, divided by the largest pressure."""
+    """Return the rms difference of pressures (nx, ny) from means of neighbours, divided by the largest pressure."""
     deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
     return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
 

@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if domains overlap.  Return this function for the next check; after a warning, None."""
+    """Warn about the fullest cell if domains overlap.  Return this function for the next check, or None if warned."""
     grid, points = cut.grid, cut.points
     volume = cut.shares(points.volume0 * points.J)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)

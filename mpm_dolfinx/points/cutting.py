@@ -437,7 +437,7 @@ def _products(
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return the integral over each slice of the product of up to three coordinates, or of 1 without coordinates."""
+        """Return the integral over each slice of a product of up to three coordinates, or of 1 without factors."""
         if not factors:
             return area
         if len(factors) == 1:

@@ -120,7 +120,7 @@ def solve_substep(
     `solvers`: linear solvers for the unknowns of the active cells.
     `momentum`, `storage`: the balances. `storage` is None without fluid.
     `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    `as_reset`: context with the state at the last grid reset.  `key`: for linear laws, cache key of this state's tangent.
+    `as_reset`: context with the state at the last grid reset.  `key`: for linear laws, cache key of that tangent.
     `report`: report of the step, to which the counts of the substep are added.
     `kept`: factors that the tangents of the step share.
 
