@@ -3,7 +3,7 @@
 
 The scenes are a cantilever (the poroelastic beam, undeformed and bent) and a footing on a column. The linear system of
 the first Newton step is solved to a relative residual of 1e-8. Only the product of conductivity and step length
-matters. It ranges from 1e-23 to 1e11 m. The bulk modulus K_w of the water ranges from 1e4 Pa to infinity.
+matters. This product is 1e-23 to 1e11 m. The bulk modulus K_w of the water ranges from 1e4 Pa to infinity.
 
 Three schemes are compared. An iteration of each scheme consists of one solve of the storage and one solve of the
 momentum.

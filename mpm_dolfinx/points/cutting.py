@@ -272,7 +272,7 @@ class _Slots:
         self.cell = self.low[:, self.point] + self._place
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the slots of the domains `owner` (n,) and their cells with the grid indices `index` (d, n)."""
+        """Return the slots (n,) of n pairs: domains `owner` (n,), and cells with the grid indices `index` (d, n)."""
         before = self._start - np.add.reduce(self.low * self._stride)
         out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
         for place, stride in zip(index[:-1], self._stride, strict=False):

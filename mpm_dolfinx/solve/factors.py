@@ -2,8 +2,8 @@
 """Direct linear solvers.  `solver_choice.plan` chooses between direct solvers and multigrid.
 
 On one process, PETSc factorises displacement matrices with a block for each node, in nested-dissection order.  With
-33000 unknowns in 2D and a symmetric matrix, the first factorisation takes 214 ms with these blocks, and 888 ms without
-blocks in minimum degree order.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
+33000 unknowns in 2D and a symmetric matrix, the first factorisation takes 214 ms with these blocks, and 888 ms in
+minimum degree order without blocks.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
 
 On several processes, one process has the factors of displacements, and another process the factors of pressures.  In
 large scenes, all processes share the factors of MUMPS (`Thresholds.mumps`).

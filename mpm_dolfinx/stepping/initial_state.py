@@ -102,7 +102,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
 
 
 def _warn_rain(scene: Scene, points: MaterialPoints, rains: Mapping[str, Rain]) -> None:
-    """Warn of implausible values of rain, and of rain on soil with suction that cannot take it up."""
+    """Warn of implausible values of rain, and of rain that soil with suction cannot take up."""
     materials, comm = scene.materials, scene.grid.comm
     most = max(np.inf if callable(m.conductivity) else np.max(m.conductivity) for m in materials.materials)
     for name, rain in rains.items():
@@ -428,7 +428,7 @@ def balanced(scene: Scene, state: State) -> State:
     Raises
     ------
     ValueError
-        No equilibrium exists with these laws.
+        No equilibrium exists with the laws of the scene.
     """
     forms, materials = scene.momentum, scene.materials
     try:

@@ -39,7 +39,7 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain, in cell sizes, without renewal. Source: definition."""
+"""Largest length of a domain, in cell sizes, that does not cause a renewal. Source: definition."""
 
 
 class Renewal:

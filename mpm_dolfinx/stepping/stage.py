@@ -84,7 +84,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        A name is invalid, or two conditions have an equal name.
+        A name is invalid, or two conditions have the same name.
     """
     given = [getattr(one, "name", None) for one in conditions]
     for name, one in zip(given, conditions, strict=True):

@@ -114,7 +114,7 @@ class BiotFEM:
     Parameters
     ----------
     grid
-        Mesh of the box-shaped body: a `Grid` with cells of equal size, which no other model uses.
+        Mesh of the box-shaped body: a `Grid` with cells of equal size.  No other model may use this grid.
     material, fluid
         `material`: skeleton whose law has no state variables and no local unknowns.  `fluid`: pore fluid, or None.
         With steep retention curves (n > 2.5, or with an air entry), steps may fail to converge.
