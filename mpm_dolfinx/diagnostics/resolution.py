@@ -188,7 +188,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, and neither walls nor other bodies prevent bending along the axis."""
+    """Return whether a body is thin along an axis, and neither walls nor other bodies prevent such bending."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

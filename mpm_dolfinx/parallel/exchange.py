@@ -91,7 +91,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the sum of a number, or of each entry of an array, over all processes.  `op`: reduction in place of a sum."""
+    """Return the sum of a number, or of each entry of an array, over all processes.  `op`: operation, if not a sum."""
     if comm.size == 1:
         return value
     if not isinstance(value, np.ndarray):
