@@ -107,7 +107,7 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 
 @dataclass
 class Frame:
-    """State of the bank at one time, in s.
+    """State of the bank at the time t, in s.
 
     corners: corners of the domains, in m.
     surface (k, 2): positions from the crown to the toe, in m.
