@@ -419,7 +419,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Smallest and largest tabulated suction, divided by `scale`.  Source: outside this range k_r is 1 or 0, to 1e-8."""
+"""Range of tabulated suctions, divided by `scale`.  Source: outside this range k_r is 1 or 0, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, and twice this value by 2.6e-09.  Finer cells change it by 6.6e-03.
