@@ -234,7 +234,7 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell; cells with
+    Indices (c,) of the batch's cells in `Places.filled`.  Indices (c, most) of the points in each cell; cells with
     fewer than `most` points have placeholders at the end.  Mask (c, most), True for placeholders.
     """
     cells = places.cells

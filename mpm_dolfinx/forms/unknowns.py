@@ -136,7 +136,7 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has released on all processes.  All processes must call this function.
 
     PETSc keeps released objects in memory, because the order of release may differ between processes.  PETSc before
-    about 3.20 also does so on a single process.  Without this function, the matrices of all steps would stay in memory.
+    about 3.20 keeps them on one process, too.  Without this function, the matrices of all steps would stay in memory.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)

@@ -170,7 +170,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
     """Cut the particle domains by the grid.
 
     `corners` (n, 2^d, d), in m: corners of the domains, inside the grid, in the order of `corner_bits`.
-    `second`: whether to compute second moments of the pieces.  `faces`: whether to compute their areas on cell faces.
+    `second`: whether to compute second moments of the pieces.  `faces`: whether to compute areas on cell faces.
 
     Returns
     -------

@@ -423,7 +423,7 @@ class Motion:
         return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the edge lengths of boxes with the reference volumes of the domains."""
+        """Return the edge lengths (n, d), in m, of undeformed boxes that have the reference volumes of the points."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
         size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])

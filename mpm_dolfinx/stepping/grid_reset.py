@@ -407,7 +407,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain; 1 without a retention curve; None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain, or 1 as a placeholder.  None in saturated scenes."""
         if self._materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
