@@ -59,7 +59,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return powers of ten from 10^low to 10^high, each 10^step times the power before."""
+    """Return powers of ten from 10^low to 10^high, each 10^step times as large as the power before."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 

@@ -56,7 +56,7 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Arrays with one entry for each local cell, or unrolled local degree of freedom.  `clear` sets these arrays to 0.
+        Arrays with a row for each local cell, and for each unrolled local dof.  `clear` sets these arrays to 0.
 
     Attributes
     ----------
