@@ -275,7 +275,7 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Set the initial guess of Newton's method. Return its errors, and an alternative guess or None.
 
-        The guess is the result of `ahead` if its residual is small, else in each part the u with the smallest residual.
+        The guess is the result of `ahead`. If its residual is large, each part takes the u with the smallest residual.
         """
         start = self._iterate()
         if ahead is not None:
