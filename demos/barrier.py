@@ -61,7 +61,7 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 
 @dataclass
 class Frame:
-    """State of the bank at one time, in s.
+    """State of the bank at the time t, in s.
 
     corners (n, 4, 2): corners of the domains, in m.
     moved (n,): magnitudes of the displacements of the points, in m.
@@ -119,7 +119,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
         out.frames.append(Frame(s.t, corners, moved, force, between, depth))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the strength of the clay at the end of the next step."""
+        """Give the clay the strength that it will have at the end of the next step."""
         s.stage(fields={"cohesion": STRONG + min(1.0, (s.t + dt) / DURATION) * (WEAK - STRONG)})
 
     def go(t_end: float, dt: float, *observers) -> None:

@@ -6,7 +6,7 @@ feature hardly changes the results. Examples are a gravity of zero, a conductivi
 from yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
 dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.
 
-The two scenes of a pair alternate, each with four steps at a time, --repeat times. The table gives the run time of the
+The two scenes of a pair take turns of four steps each, --repeat times. The table gives the run time of the
 fastest step of each scene. All times are processor times. The compile time is the additional time of the first step
 with an empty cache of compiled forms. The memory is the peak memory with a full cache.
 """

@@ -5,7 +5,7 @@ Each threshold is a number of displacement unknowns. Each row of the table is a 
 time is the processor time of two steps, in the fastest of --repeat runs. On several processes, the time is the largest
 of all processes, including waiting. The thresholds are in `mpm_dolfinx/solve/solver_choice.py`.
 
-On one process a second table follows. It lists three times for each direct solver: the first factorisation of the
+On one process a second table follows. For each direct solver, it lists the times of a first factorisation of the
 stiffness matrix, a repeated factorisation, and a solve.
 """
 
@@ -78,7 +78,7 @@ def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -
 
 
 def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]]]:
-    """Yield for each direct solver its name, the number of unknowns, and the three times of the second table, in s."""
+    """Yield the name of each direct solver, the number of unknowns, and the times (s) in the second table."""
     s = block(2, n, soil, True)
     s.step(1.0)
     tangent = s.tangent(1.0)

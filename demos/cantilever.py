@@ -10,9 +10,9 @@ There are two references. The elastica (Bisshopp & Drucker 1945) neither stretch
 rod (Reissner 1972, Simo 1985) also stretches, with the stiffness E A, and shears, with the stiffness 5/6 G A. Here A is
 the area of the section and G the shear modulus. The demo runs on one process.
 
-Each alpha has two errors, such as `v_1` and `u_1`: the differences between beam and rod, divided by L. The first is the
-error of the tip deflection, and the second that of the shortening. Converged finite elements have errors of at most
-0.08 %. On fine grids the material points converge to these finite elements with second order in the cell size.
+Each alpha has two errors, such as `v_1` and `u_1`: the differences between beam and rod, divided by L. Errors `v` refer
+to the tip deflection, and errors `u` to the shortening. Converged finite elements have errors of at most 0.08 %. On
+fine grids the material points converge to these finite elements with second order in the cell size.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the cavity to a radius (m), in steps of at most `push` cells, and return its `pressure`."""
+    """Widen the cavity to a radius (m), in steps of at most `push` cells, and return the cavity pressure."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)

@@ -57,7 +57,7 @@ class Heap(NamedTuple):
 
 
 def published(aspect: float) -> float:
-    """Return the run-out by Lube et al., divided by the width of the column."""
+    """Return the run-out according to Lube et al., divided by the width of the column."""
     return float(np.interp(aspect, (1.8, 2.8), (0, 1)) * (1.9 * aspect ** (2 / 3) - 1.2 * aspect) + 1.2 * aspect)
 
 

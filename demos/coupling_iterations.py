@@ -3,7 +3,7 @@
 
 The scenes are a cantilever (the poroelastic beam, undeformed and bent) and a footing on a column. The linear system of
 the first Newton step is solved to a relative residual of 1e-8. Only the product of conductivity and step length
-matters. It ranges from 1e-23 to 1e11 m. The bulk modulus K_w of the water ranges from 1e4 Pa to infinity.
+matters. This product is 1e-23 to 1e11 m. The bulk modulus K_w of the water ranges from 1e4 Pa to infinity.
 
 Three schemes are compared. An iteration of each scheme consists of one solve of the storage and one solve of the
 momentum.
@@ -208,7 +208,7 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
 
 
 def roughness(p: NDArray[np.float64]) -> float:
-    """Return the rms difference between pressures (nx, ny) and means of neighbours, divided by the largest pressure."""
+    """Return the rms difference of pressures (nx, ny) from means of neighbours, divided by the largest pressure."""
     deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
     return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
 

@@ -43,7 +43,7 @@ class Weighed(mpm.Hencky):
 
     @staticmethod
     def energy(F, bulk, shear, unit_weight):
-        """Return the energy (UFL), in Pa."""
+        """Return the stored energy per reference volume (UFL), in Pa."""
         return mpm.Hencky.energy(F, bulk, shear)
 
 
@@ -52,7 +52,7 @@ SAND = Weighed(bulk=1e7, shear=6e6, conductivity=1e-6, unit_weight=lambda X: np.
 
 
 def weight(points, v):
-    """Return the work (UFL) of the buoyant weight, with the test function v."""
+    """Return the virtual work (UFL) of the buoyant weight for the test function v."""
     return points.unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
 
 

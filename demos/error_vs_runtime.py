@@ -3,7 +3,7 @@
 
 Five cases have an exact or converged solution. In each case the cell size varies. For material points, the points per
 cell, the quadrature and the coupling vary too. Two body-fitted finite element methods are compared: Q1/DG0 on cells of
-equal size, and Taylor-Hood. The time is the shortest of `--repeat` runs of the time loop. Compile times are separate.
+equal size, and Taylor-Hood. The time is the shortest of `--repeat` runs of the time loop, without compilation.
 Reference solutions are converged in space and in time.
 
 * beam: the poroelastic beam. Two errors of the tip deflection are given: the largest at all output times, and the

@@ -31,8 +31,8 @@ longer than its finer neighbour, up to eight times the smallest length.
 With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells. The
 footings are tools. A quarter of the square is computed in 3D. N_c is the limit load, divided by area and c. The bounds
 of N_c are 5.52 and 6.22 for a rough square (Salgado, Lyamin, Sloan and Yu 2004), and 2 + pi and 5.71 for a smooth
-square (Shield and Drucker 1955). Circles are computed in axisymmetry, on cells about half as large. The exact N_c is
-6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield 1955).
+square (Shield and Drucker 1955). Circles are computed in axisymmetry, on cells about half as large as for squares. The
+exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield 1955).
 
 With non-associated flow the solution is not unique (Rudnicki and Rice 1975). Shear bands change their position between
 steps, and on fine grids many steps are cut. The option --viscosity adds a small viscous stress, which makes the
@@ -259,7 +259,7 @@ def limit_load(
 
     how: key of `LIMITS_OF`.
     box, graded: see `push`; by default the box of `LIMITS_OF`, with cells of equal size.
-    steps: number of computed steps; a complete undrained push has 40 steps.
+    steps: number of computed steps of the undrained push, which is complete after 40. Other pushes take 40 steps.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own

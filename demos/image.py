@@ -33,7 +33,7 @@ TOP = ((0.0, 0.999 * EDGE), (EDGE, EDGE))  # region of the upper edge, because h
 
 
 def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
-    """Return grey values (x, y) from 0 to 1, with holes outside the largest connected part."""
+    """Return grey values from 0 to 1, indexed by (x, y). Pixels outside the largest connected part are 0 (holes)."""
     noise = np.random.default_rng(seed).standard_normal((pixels, pixels))
     smooth = gaussian_filter(noise, pixels / 16, mode="reflect")
     smooth += 3 * smooth.std() * np.exp(-np.arange(pixels)[::-1] / (0.06 * pixels))  # no holes near the plate
@@ -57,7 +57,7 @@ class Tissue:
         return (x[:, 1] < EDGE) & (self.at(x) >= HOLES)
 
     def law(self, holes: float = 1.0) -> mpm.Hencky:
-        """Return the law of the tissue, with `holes` times the stiffness of black tissue in holes."""
+        """Return the law of the tissue. Holes have `holes` times the stiffness of black tissue."""
 
         def scaled(value: float, power: int) -> mpm.Field:
             return lambda X: value * np.where(self.at(X) < HOLES, holes**power, CONTRAST ** (power * self.at(X)))

@@ -60,7 +60,7 @@ class Outcome:
 
 
 def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[str, float], Outcome]:
-    """Consolidate the quarter until T = 1, with `steps` equal steps up to each time in `SAMPLES`.
+    """Consolidate the quarter until T = 1, with `steps` equal steps between successive times in `SAMPLES`.
 
     Returns the errors by name, and the histories.
     """

@@ -13,8 +13,8 @@ wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 
 
 Clay that flows around the bar stretches by a factor of about e^4 for each diameter of depth. After each quarter of a
 diameter, the clay is therefore seeded with new points, which take over the stresses (Hu and Randolph 1998). After each
-new seeding, N is lower for one or two steps. Errors refer to the mean of N over the steps before each new seeding.
-`spread` is the range of N in these steps, divided by this mean.
+new seeding, N is lower for one or two steps. Errors refer to the mean of N over the last quarter of the distance
+between two seedings. `spread` is the range of N over the same distances, divided by this mean.
 
 A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates V. The rate is
 `V = v D / c_v`, with the velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so

@@ -18,9 +18,9 @@ processes is
 
     T = e + a n / P + b H + c log2 P,
 
-where H is the number of points along the faces that a process shares with others. The cost e is fixed. The other terms
-are the work for all points, the work for points at shared faces, and the number of messages. In 2D the model excludes
-the solvers, because the cost of factorisations is not proportional to n / P.
+where H is the number of points along the faces that a process shares with others. The cost e is the same for any n and
+P. The other terms are the work for all points, the work for points at shared faces, and the number of messages. In 2D
+the model excludes the solvers, because the cost of factorisations is not proportional to n / P.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 
 @dataclass
 class Frame:
-    """State of the bank at one time, in s.
+    """State of the bank at the time t, in s.
 
     corners: corners of the domains, in m.
     surface (k, 2): positions from the crown to the toe, in m.
@@ -198,7 +198,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the cohesion at the end of the next step."""
+        """Give the soil the cohesion that it will have at the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 
@@ -288,7 +288,7 @@ def stages(run: Slump) -> dict[str, int]:
 
 
 class Panel:
-    """Drawing of a frame: domains coloured by values, and the surface."""
+    """Picture of a frame: domains coloured by values, and the surface."""
 
     def __init__(self, ax, frame: Frame, values: np.ndarray, **style):
         from matplotlib.collections import PolyCollection

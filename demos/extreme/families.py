@@ -59,7 +59,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return powers of ten from 10^low to 10^high, each 10^step times the power before."""
+    """Return powers of ten from 10^low to 10^high, each 10^step times as large as the power before."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
@@ -245,7 +245,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Compare a beam with FEM, and a column with exact values. Their outermost cells are filled to 1e-10 to 0.5."""
+    """Compare a beam with FEM, and a column with exact values. Of their outermost cells, 1e-10 to 0.5 is filled."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f

@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if particle domains overlap.  Return this function, or None after the warning."""
+    """Warn about the fullest cell if domains overlap.  Return this function for the next check, or None if warned."""
     grid, points = cut.grid, cut.points
     volume = cut.shares(points.volume0 * points.J)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -162,7 +162,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     displacement field of this kind, and walls prevent it.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
-        low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # lower ends: lowest; highest within a cell
+        low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # lower ends: lowest; highest off grid lines
         cells = []
         for part in in_chunks(len(body)):
             x = body.corners(part) - grid.base
@@ -188,7 +188,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, and neither walls nor other bodies prevent bending along it."""
+    """Return whether a body is thin along an axis, and neither walls nor other bodies prevent such bending."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

@@ -27,7 +27,7 @@ def check_held(
     `free` (nodes, d): whether no wall fixes a displacement component.
     `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple: constrained cells (n,),
     opposite cells (n,), positions (n, d) in m, and directions (n, d).  In a contact, opposite cells are lexicographic
-    indices; otherwise they are None.  A fixed part fixes the parts in contact with it.
+    indices; in all other constraints they are None.  A fixed part fixes the parts in contact with it.
     `each`: whether to check each connected part alone, and not all parts together as one body.
 
     Raises

@@ -35,7 +35,7 @@ def balancing_tractions(
     `stresses`: total stresses (faces, k, k), in Pa, with k = d or 3, at the faces of each side.
     `parts`: connected parts of the bodies.
     `forces` (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
-    `held` (nodes, d): whether each displacement component of a node remains fixed.
+    `held` (nodes, d): whether each displacement component of a node is fixed in the new stage.
 
     Returns the ids (n,) of the points on each side and their tractions (n, d), in Pa, by name of the side.
     """

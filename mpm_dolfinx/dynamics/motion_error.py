@@ -33,7 +33,7 @@ def motion_error(
 
     `K`, `mass`: momentum tangent and mass matrix of the last substep.
     `flights`: velocities and accelerations after the two substeps.
-    `seconds`, in s: weight of the first substep's time derivatives in the last substep.  `own`: weight of its own.
+    `seconds`, `own`, in s: weights of the time derivatives of the first and of the last substep, in the last substep.
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights

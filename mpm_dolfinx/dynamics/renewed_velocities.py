@@ -33,7 +33,7 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups of pieces.
 
-        `piece` (k,): index in `pieces` of each of k pieces.  `group` (k,): index of the piece's group.
+        `piece` (k,): indices of k pieces in the array `pieces`.  `group` (k,): index of the group of each piece.
         `mass` (k,), in kg: masses of these pieces.
         `v` (n, 2), in m/s: velocity of each domain.
         `L` (n, 2, 2), in 1/s: velocity gradient of each domain.
@@ -110,6 +110,6 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return each piece of a removed domain, the group of new domains that receives the piece, and its mass."""
+    """Return the pieces of removed domains, the groups of new domains that receive them, and the received masses."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]

@@ -150,7 +150,7 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, which the caller assembles.  Return the integrals (cells, quantities) of `beside`."""
+        """Add the matrix to `A`, for assembly by the caller.  Return the integrals (cells, quantities) of `beside`."""
         sums = self._sums(data, given)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
@@ -199,7 +199,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, which the caller assembles.  Return the integrals (cells, quantities) of `beside`."""
+        """Add the matrix to `A`, for assembly by the caller.  Return the integrals (cells, quantities) of `beside`."""
         live, filled = self._values.live(data, given), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
@@ -234,7 +234,7 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell; cells with
+    Indices (c,) of the batch's cells in `Places.filled`.  Indices (c, most) of the points in each cell; cells with
     fewer than `most` points have placeholders at the end.  Mask (c, most), True for placeholders.
     """
     cells = places.cells

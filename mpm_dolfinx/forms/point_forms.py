@@ -38,7 +38,7 @@ from mpm_dolfinx.grid.grid import Grid, distinct, in_chunks, sum_by
 
 BATCH, MANY = 2**10, 2**12
 """`BATCH`: number of points in a batch of element matrices, which fits into the processor's cache.  `MANY`: number of
-points in one evaluation of an expression.  If fewer than `MANY` points remain, each evaluation takes `BATCH`.
+points in one evaluation of an expression.  If fewer than `MANY` points remain, each evaluation takes `BATCH` points.
 """
 
 
@@ -57,7 +57,7 @@ class FormPoints:
     """UFL coefficients for quantities at the points.  `PointData` contains their values.
 
     `grid`: background grid.
-    `fields`: shape of each quantity, by name.  The attribute of this name is the coefficient.
+    `fields`: shape of each quantity, by name.  The coefficient of a quantity is the attribute of this name.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -146,7 +146,7 @@ class FormPoints:
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
     def moved_by(self, u: fem.Function):
-        """Return u at the points as UFL.  On a grid of unequal cells, it is a coefficient with values from numpy."""
+        """Return u at the points as UFL, on a grid of unequal cells as a coefficient whose values numpy computes."""
         if self.grid.even:
             return self.value(u)
         d = self.grid.dim
@@ -215,7 +215,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Dofs (n,) of Q1 vectors in all cells with points, and indices in this array of the dofs of each cell."""
+        """Dofs (n,) of Q1 vectors in all cells with points, and for each cell the indices of its dofs in this array."""
         d = self.grid.dim
         nodes, at = distinct(self.grid.cell_nodes[self.filled], len(self.grid.node_x))
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
@@ -230,7 +230,7 @@ class Places(Keyed):
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients, in 1/m, of the Q1 shape functions at points.  For pieces in 3D, they are means."""
+        """Return the gradients, in 1/m, of the Q1 shape functions at points.  In 3D, they are means over pieces."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 

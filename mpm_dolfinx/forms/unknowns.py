@@ -109,7 +109,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
     """Return the PETSc matrix with the given rows and number of columns on this process.
 
-    `own`: whether `rows` has local column indices, and not global ones.
+    `own`: whether the column indices of `rows` are local; otherwise they are global.
     """
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
@@ -136,7 +136,7 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has released on all processes.  All processes must call this function.
 
     PETSc keeps released objects in memory, because the order of release may differ between processes.  PETSc before
-    about 3.20 also does so on a single process.  Without this function, the matrices of all steps would stay in memory.
+    about 3.20 keeps them on one process, too.  Without this function, the matrices of all steps would stay in memory.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)

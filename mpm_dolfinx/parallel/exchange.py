@@ -91,7 +91,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the sum of a number, or of each entry of an array, over all processes.  `op`: another reduction."""
+    """Return the sum of a number, or of each entry of an array, over all processes.  `op`: operation, if not a sum."""
     if comm.size == 1:
         return value
     if not isinstance(value, np.ndarray):
@@ -143,7 +143,7 @@ def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Call `action` on rank 0, and return its result on every process.  If it fails, all raise its error."""
+    """Call `action` on rank 0, and return its result on every process.  If `action` fails, all raise its error."""
     return comm.bcast(together(comm, lambda: action() if comm.rank == 0 else None))
 
 

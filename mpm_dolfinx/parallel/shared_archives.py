@@ -56,7 +56,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
     for (name, of), length in zip(rows.items(), total.tolist(), strict=True):
         info, head = ZipInfo(f"{name}.npy"), _head(of.dtype, (length, *of.shape[1:]))
         size = length * _row_bytes(of.dtype, of.shape)
-        info.CRC = 0  # replaced when it is known
+        info.CRC = 0  # replaced when the checksum is known
         info.file_size = info.compress_size = len(head) + size
         info.header_offset = end
         start = end + len(info.FileHeader(zip64=True)) + len(head)
@@ -162,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of joined bytes.  `crc`: checksum of the first; `parts`: checksums and lengths of others."""
+    """Return the checksum of joined blocks, from the checksum of the first, and checksums and lengths of the others."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc

@@ -56,7 +56,7 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Arrays with one entry for each local cell, or unrolled local degree of freedom.  `clear` sets these arrays to 0.
+        Arrays with a row for each local cell, and for each unrolled local dof.  `clear` sets these arrays to 0.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Active:
     centroid : (cells, d), m
         Vector from the midpoint of the cell to the centroid of its material.  The array is empty without fluid.
     opening : (cells, d, 2)
-        Fractions of the cell faces that material covers.  The array is empty without fluid.
+        Fraction of each cell face that material covers.  The array is empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):

@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, c
 SLIVER = NEAR**2
 """Smallest volume of a piece, divided by the volume of its domain.  Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
-TANGLED = 0.2  # smallest volume inside the corners / volume of the point, without re-initialisation from F
+TANGLED = 0.2  # smallest volume inside the corners, divided by the point's volume, without re-initialisation
 
 
 @dataclass
@@ -64,7 +64,7 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 def simplices(dim: int) -> NDArray[np.int64]:
     """Return the simplices (4 or 24, d+1) of a domain: indices of their vertices in the result of `vertices`.
 
-    The corners of a simplex are a facet of the surface, oriented outward, and the middle of the domain.
+    The vertices of a simplex are the corners of a facet of the surface, oriented outward, and the middle of the domain.
     """
     rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
     facets = []
@@ -84,7 +84,7 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def simplex_volumes(v: NDArray[np.float64], most: int | None = None) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains, or of the first `most`.  `v`: see `vertices`."""
+    """Return the signed volumes (k, n) of all, or of the first `most`, simplices of n domains.  `v`: see `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1])[:most].T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
@@ -170,7 +170,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
     """Cut the particle domains by the grid.
 
     `corners` (n, 2^d, d), in m: corners of the domains, inside the grid, in the order of `corner_bits`.
-    `second`: whether to compute second moments of the pieces.  `faces`: whether to compute their areas on cell faces.
+    `second`: whether to compute second moments of the pieces.  `faces`: whether to compute areas on cell faces.
 
     Returns
     -------
@@ -192,7 +192,7 @@ def on_planes(
     """Return positions in cell units, and positions for slicing.  Positions near a grid plane are moved onto this
     plane.
 
-    Positions for slicing are in cell units if all cells have one size, and else in m.
+    Positions for slicing are in cell units if all cells have equal size; otherwise they are in m.
 
     `true`: positions from the lower corner of the grid, in cell units.
     `x`, in m: the same positions, from the base of the grid.
@@ -272,7 +272,7 @@ class _Slots:
         self.cell = self.low[:, self.point] + self._place
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the slots of the domains `owner` (n,) and their cells with the grid indices `index` (d, n)."""
+        """Return the slots (n,) of n pairs: domains `owner` (n,), and cells with the grid indices `index` (d, n)."""
         before = self._start - np.add.reduce(self.low * self._stride)
         out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
         for place, stride in zip(index[:-1], self._stride, strict=False):
@@ -280,7 +280,7 @@ class _Slots:
         return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return sums of values: for each slot, over all slots of its domain with larger grid indices along an axis."""
+        """For each slot, return the sum of `values` over the slots of its domain with larger indices along `axis`."""
         out = np.zeros(self.size)
         for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -437,7 +437,7 @@ def _products(
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return integrals over each slice: of the product of the given coordinates (at most three), or of 1."""
+        """Return the integral over each slice of a product of up to three coordinates, or of 1 without factors."""
         if not factors:
             return area
         if len(factors) == 1:
@@ -513,7 +513,7 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide the parts of faces in cells into triangles, independently of the order in which the axes were cut."""
+    """Divide the part of each face in each cell into triangles that do not depend on the order of the cuts."""
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
     cell = np.floor(slices_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)
@@ -550,7 +550,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of the next entry in the same group, cyclically, for ascending groups."""
+    """Return the index of the next entry in the same group; the first entry follows the last. `group` ascends."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
@@ -589,7 +589,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane.  Return parts below it and their entries of `owner`, then the same above it."""
+    """Cut each simplex at its plane.  Return parts below planes, their owners, parts above planes, their owners."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane

@@ -16,7 +16,7 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 AT_ONCE = 2**13
 """Number of positions in an array operation, so that the arrays fit into the cache of the processor."""
 START = 2**8 - 1
-"""Number of nodes of the tree above the level at which the search for a near facet starts."""
+"""Number of nodes above the level of the tree at which the search for a near facet starts."""
 
 
 class Boxes(NamedTuple):

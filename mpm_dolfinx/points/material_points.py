@@ -251,7 +251,7 @@ class MaterialPoints:
         return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return indices (k,) in `ids` of the k ids on this process, and the indices (k,) of their points."""
+        """Return the indices (k,) of this process's ids in the array `ids`, and the indices (k,) of their points."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)

@@ -147,7 +147,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part of each cell, and the number of parts.  `index`: grid indices and copy of each cell."""
+    """Return the connected part of each cell, and the number of parts.  `index`: grid indices, and copy of the grid."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)

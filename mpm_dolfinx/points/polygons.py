@@ -91,7 +91,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Remove vertices on straight edges.  Neighbouring vertices closer than `near`, in m, become their mean."""
+        """Remove vertices on straight edges.  Replace neighbouring vertices closer than `near`, in m, by their mean."""
         n, most = self.edge.shape
         used = np.arange(most) < self.count[:, None]
         kept = used & (np.abs(self.after - self.x).max(axis=2) > near)

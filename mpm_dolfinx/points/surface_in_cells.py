@@ -19,7 +19,7 @@ Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the res
 BENT = 1 - 3**0.5 / 2
 """Largest deviation of a surface without a corner from its chord, in cell sizes.
 
-Source: exact for a chord and a radius of one cell size.
+Source: exact for an arc with a chord and a radius of one cell size.
 """
 RING = np.array([0, 1, 3, 2])
 """Corners of a particle domain, anti-clockwise."""
@@ -69,7 +69,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area fraction of each of `count` cells.  All cells that are not in `cells` have 1."""
+        """Return the filled area fraction of each of `count` cells.  The fraction is 1 in cells outside `cells`."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -123,7 +123,7 @@ def resampled(
     joint = (x[:, 0] + np.roll(x[:, 1], 1, axis=0)) / 2  # there may be small gaps between segments
 
     def divide(low: int, high: int) -> None:
-        """Set a vertex between two others, at the sharpest bend or in the middle."""
+        """Place a vertex between two other vertices, at the sharpest bend or in the middle."""
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
         off = joint - a[of]

@@ -205,13 +205,13 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return values of S and k_r, and the suctions, in Pa, for which a law gives these values."""
+    """Return the values of S and k_r that a law has at some suctions, and these suctions, in Pa."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the number that a UFL function of the pressure has at the pressure p, in Pa."""
+    """Return the value of a UFL function of the pressure at the pressure p, in Pa."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
@@ -419,7 +419,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Smallest and largest tabulated suction, divided by `scale`.  Source: k_r is 1 below, and 0 above, exact to 1e-8."""
+"""Range of tabulated suctions, divided by `scale`.  Source: outside this range k_r is 1 or 0, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, and twice this value by 2.6e-09.  Finer cells change it by 6.6e-03.
@@ -444,7 +444,7 @@ FARTHEST = np.log(10)
 """Largest change of the natural logarithm of the suction in a Newton step.
 
 Without this limit, fronts in dry soil do not converge.  With the limit 2, the column of Celia (1990) takes 310 Newton
-steps in 25 cells, and 500 in 100 cells.  With the limit 4, it takes 330 Newton steps in 25 cells, and 920 in 100 cells.
+steps with 25 cells, and 500 with 100 cells.  With the limit 4, it takes 330 and 920 Newton steps.
 
 Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, and twice this value by
 9.8e-10. Finer cells change it by 6.6e-03.

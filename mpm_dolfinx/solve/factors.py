@@ -2,8 +2,8 @@
 """Direct linear solvers.  `solver_choice.plan` chooses between direct solvers and multigrid.
 
 On one process, PETSc factorises displacement matrices with a block for each node, in nested-dissection order.  With
-33000 unknowns in 2D and a symmetric matrix, the first factorisation takes 214 ms with these blocks, and 888 ms without
-blocks in minimum degree order.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
+33000 unknowns in 2D and a symmetric matrix, the first factorisation takes 214 ms with these blocks, and 888 ms in
+minimum degree order without blocks.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
 
 On several processes, one process has the factors of displacements, and another process the factors of pressures.  In
 large scenes, all processes share the factors of MUMPS (`Thresholds.mumps`).
@@ -38,7 +38,7 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve and after changes of A.
 
-    `symmetric`: whether the factors are L D L^T, or else L U.
+    `symmetric`: whether the factors are L D L^T; otherwise they are L U.
     `gathered`: whether only the last process has the factors, for many solves with the same matrix.
     `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several processes.
     """
@@ -70,14 +70,14 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 
 
 def renew(A: PETSc.Mat) -> None:
-    """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices."""
+    """Rebuild the sparsity pattern of a matrix in PETSc, after other matrices were added to this matrix."""
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 
 
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of the last solve. Raise NotConverged if this solve failed.
 
-    A solve that ends with an indefinite matrix, or after the largest number of iterations, has not failed.
+    A solve has not failed if it ends at an indefinite matrix, or after the largest number of iterations.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -212,7 +212,7 @@ class NodalFactors:
     """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
     `unknowns`: unknown displacements, with consecutive components of each node.
-    `symmetric`: whether the factors are U^T D U, or else L U.
+    `symmetric`: whether the factors are U^T D U; otherwise they are L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):
@@ -264,7 +264,7 @@ class BlockFactors:
     `block`, `axis`: node and component of each unknown.
     `x` (n, d): position of each unknown, m.
     `dim`: number of components of a node.
-    `symmetric`: whether the factors are U^T D U, or else L U.
+    `symmetric`: whether the factors are U^T D U; otherwise they are L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):

@@ -227,7 +227,7 @@ class BlockSolver:
 
 
 class Foresight:
-    """Monitor that ends a solve early if it converges too slowly for its largest number of iterations.
+    """Monitor that ends a solve early if the allowed number of iterations would not suffice.
 
     `interval`: number of iterations between two predictions.
     """

@@ -48,11 +48,11 @@ SMOOTHERS = {
 14^3 cells with nu = 0.49, in layers with a stiffness ratio of 1000. GMRES takes 126 iterations with this smoother, and
 112 iterations with GAMG. With one sweep, GMRES fails.
 
-`INCOMPLETE` is for yielding soil: incomplete factors without fill (Wittum 1989), one block on each process. Chebyshev's
-single step is a step of Richardson's method, with a factor from an estimate of the largest eigenvalue. Sweeps converge
-slowly in yielding soil. The test is the block beyond its limit load in `tests/test_solvers.py`. With 24^3 cells, one
-solve takes 82 iterations with three sweeps, and 11 iterations with incomplete factors. At nu = 0.49, incomplete factors
-fail, and three sweeps replace them.
+`INCOMPLETE` is for yielding soil: incomplete factors without fill (Wittum 1989), one block on each process. One step of
+Chebyshev's method applies these factors. Such a single step is a step of Richardson's method, with a damping factor
+from an estimate of the largest eigenvalue. Sweeps converge slowly in yielding soil. The test is the block beyond its
+limit load in `tests/test_solvers.py`. With 24^3 cells, one solve takes 82 iterations with three sweeps, and 11
+iterations with incomplete factors. At nu = 0.49, incomplete factors fail, and three sweeps replace them.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max

@@ -42,7 +42,7 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import SHIFT, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # tolerance of momentum solves / storage residual; small, because wrong rotations change volumes
+INNER = 1e-3  # tolerance of momentum solves, divided by the storage residual; wrong rotations would change volumes
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of Newton steps while contacts change, divided by the usual largest number
 LOOSEST = 1e-2
@@ -56,7 +56,7 @@ SOLVED = 0.05
 cells change it by 3.0e-02.
 """
 SETTLED = 1e-2
-"""Largest relative residual at which slip of contacts may end.  At larger residuals the contact area changes.
+"""Largest relative residual at which slipping contacts may stick again.  At larger residuals, contact areas change.
 Sensitivity (scene "contact" of tests/plateaus.py): half this value changes the result by 1.5e-13, and twice this value
 by 6.4e-12.  Finer cells change it by 1.1e-02.
 """
@@ -120,7 +120,7 @@ def solve_substep(
     `solvers`: linear solvers for the unknowns of the active cells.
     `momentum`, `storage`: the balances. `storage` is None without fluid.
     `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    `as_reset`: context with the state at the last grid reset.  `key`: cache key of its tangent for linear laws.
+    `as_reset`: context with the state at the last grid reset.  `key`: for linear laws, cache key of that tangent.
     `report`: report of the step, to which the counts of the substep are added.
     `kept`: factors that the tangents of the step share.
 
@@ -264,7 +264,7 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Update contacts until no contact changes, or a residual exceeds the tolerance. Return the errors."""
+        """Update contacts until none changes, or an update lifts a residual above the tolerance. Return the errors."""
         momentum = self._momentum
         count = 0
         while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
@@ -275,7 +275,7 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Set the initial guess of Newton's method. Return its errors, and an alternative guess or None.
 
-        The guess is the result of `ahead` if its residual is small, else in each part the u with the smallest residual.
+        The guess is the result of `ahead`. If its residual is large, each part takes the u with the smallest residual.
         """
         start = self._iterate()
         if ahead is not None:
@@ -337,7 +337,7 @@ class Newton:
             return found
         if not negative_pivots(self._solvers.solve_u):
             return found
-        self._linearise()  # the last tangent may be that of another state
+        self._linearise()  # the last tangent may belong to another state
         if not (count := negative_pivots(self._solvers.solve_u)):
             return found
         self._solvers.solve_momentum()
@@ -419,7 +419,7 @@ class Newton:
         self._solvers.linearise(self._momentum, self._storage, self._kept, shift=shift)
 
     def _linearise_as_reset(self, as_reset: AsReset) -> bool:
-        """Set the tangent at the last reset of the grid."""
+        """Set the tangent for the state at the last reset of the grid."""
         with as_reset() as pieces:
             if self._storage is not None:
                 self._storage.set_fluxes()

@@ -22,7 +22,7 @@ class Numerics:
     ----------
     quadrature
         "domain": exact integration over cut particle domains. "point": integration at material points, as in standard
-        MPM, only for boxes along the grid, not in axisymmetry.
+        MPM; allowed only for boxes along the grid, and not in axisymmetry.
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance

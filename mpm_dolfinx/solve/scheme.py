@@ -19,7 +19,7 @@ COUPLINGS = {
 }
 """Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`.
 
-Here alpha is Biot's coefficient, and K_dr the drained bulk modulus. With None, beta is `1 / K_w` of the fluid.
+Here alpha is Biot's coefficient, K_dr the drained bulk modulus, K_w that of the fluid. With None, beta is `1 / K_w`.
 """
 
 

@@ -111,14 +111,14 @@ class LinearSolvers:
         """Cache whose key identifies the present tangent, if several steps use this tangent."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
-        """Newton direction of the displacements, and a work vector for right-hand sides."""
+        """`du`: Newton direction of the displacements. `_rhs`: work vector for right-hand sides."""
         self._unread = set(scheme.petsc_options)
         with _compat.Timer("factorisation"), using(scheme.petsc_options, self._unread):
             self.solve_u = self._momentum_solver()
             if storage is None:
                 return
             self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
-            """Newton direction of the pressures, and a work vector for right-hand sides."""
+            """`dp`: Newton direction of the pressures. `_g`: work vector for right-hand sides."""
             if how.route == AT_ONCE:
                 self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), False, how.coarsest)
                 cycles = self.solve_u.pc, self._solve_s.pc

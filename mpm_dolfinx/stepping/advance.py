@@ -95,7 +95,7 @@ class Motion:
         """Return the state at time t (s) after a solved step, and the number of inverted domains.
 
         `state`: state at the start of the step.
-        `on_grid`: the bodies on the grid. `data`: their integration points at the start of the step.
+        `on_grid`: the bodies on the grid. `data`: integration points of the bodies at the start of the step.
         `loads`: loads at the end of the step.
         `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. With None, volume defects
         do not change.
@@ -207,7 +207,7 @@ class Motion:
         return out
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
-        """Return a function for hydrostatic pressures, or None without gravity."""
+        """Return hydrostatic pressures (Pa) as a function of cells and positions, or None without gravity."""
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None:  # independent of conductivity: a distant permeable body must not change pressures
             return None
@@ -217,7 +217,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return the nodal values in cells where points keep their pieces, and zeros at all other nodes."""
+        """Return the values at nodes of cells where points keep their pieces, and zeros at all other nodes."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -251,7 +251,7 @@ class Motion:
         return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F of the points after a step: the mean over their pieces, scaled so that det F is a mean too."""
+        """Return F of the points after a step: the mean F of their pieces, scaled to the mean det F of these pieces."""
         pieces = data.pieces
         grid = cut.grid
         n = len(cut.points)
@@ -283,7 +283,7 @@ class Motion:
         followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return points with new corners and F, a mask of points that keep their pieces, and the count of inversions.
+        """Return points with new corners and F, a mask of points that keep pieces, and the number of inverted domains.
 
         F of elastic points follows from the corners of their domains. F of yielded points is the result of `deformed`.
         """
@@ -412,7 +412,7 @@ class Motion:
         return closed[over_all(cut.grid.comm, of, MPI.MAX)]
 
     def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest values (k, bodies) in each body. `values` (k, n): values in the active owned cells."""
+        """Return the maxima (k, bodies) of k quantities in each body. `values` (k, n): values in active owned cells."""
         (part, count), points = on_grid.active.parts_of_cells, on_grid.cut.points
         inside = np.zeros((len(self._bodies), count), dtype=bool)
         inside[self._body(points), on_grid.parts[0]] = True
@@ -423,7 +423,7 @@ class Motion:
         return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the edge lengths of boxes with the reference volumes of the domains."""
+        """Return the edge lengths (n, d), in m, of undeformed boxes that have the reference volumes of the points."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
         size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])

@@ -45,7 +45,7 @@ class Start(NamedTuple):
     data: QuadratureData
     matrices: Assembled
     dt: float  # length of the step, s
-    yielded: bool  # whether soil has yielded before, on any process
+    yielded: bool  # whether soil has yielded in an earlier step, on any process
     acting: list[Acting]  # loads of each substep
     renewed: int = 0  # number of renewed particle domains
     due: NDArray[np.float64] | None = None  # corrections of volume defects, see `OnGrid.start`
@@ -67,7 +67,7 @@ class Start(NamedTuple):
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
         """Return the error and the size of the motion in the step (`motion_error`), or zeros if the run needs neither.
 
-        `flights`: velocities after each substep.  The list is empty for bodies at rest.
+        `flights`: velocities after each substep.  The list is empty if the bodies have not moved.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -98,7 +98,7 @@ class Balances(NamedTuple):
     def results(self, state: State, last: bool) -> Outcome:
         """Return the results of conditions at the end of a substep, by quantity and name.
 
-        `last`: whether the substep is the last one.  All others need only the results that are integrated.
+        `last`: whether the substep is the last one.  Earlier substeps need only the results that are integrated.
         """
         out = self.storage.outcome() if self.storage else {}
         if last or self.inertia:
@@ -133,7 +133,7 @@ def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep, after an additional nodal displacement `State.rest` (see `Loads.moved`)."""
+    """Return the loads of each substep for nodes displaced by `State.rest`, see `Loads.moved`."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -141,7 +141,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points with the data that loads store.  Raise an error if a load does not allow the new positions."""
+    """Return the points with updated data of the loads.  Raise an error if a load does not allow the new positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:
@@ -159,7 +159,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method starts from extrapolation: in scenes with yield, or with quasi-static contact."""
+    """Return whether Newton's method starts at extrapolated displacements: for yield, or quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
@@ -174,7 +174,7 @@ def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] 
 
 
 def has_yielded(scene: Scene, state: State) -> bool:
-    """Return whether soil has yielded before, on any process."""
+    """Return whether soil has yielded in an earlier step, on any process."""
     if scene.momentum.elastic:
         return False
     evolved = bool(scene.materials.evolved(state.points).any())

@@ -41,7 +41,7 @@ def distribute(simulation: Distributed) -> None:
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d), see `Partition`.  Return False if the scene does not allow it."""
+    """Distribute the cells by boxes (ranks, 2, d), see `Partition`.  Return False if this is not possible."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

@@ -336,7 +336,7 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return the cell pressures as mass potentials, with the data for their slopes."""
+        """Return the cell pressures as mass potentials, with the data from which their slopes are computed."""
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
         place = lambda: open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)  # noqa: E731
@@ -354,7 +354,7 @@ class OnGrid(Keyed):
         return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
-        """Return the mobility of the filled owned cells at u.
+        """Return the mobility of the filled owned cells at the present displacements u.
 
         `begins`: whether invalid values raise ValueError.
         """
@@ -407,7 +407,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain; 1 without a retention curve; None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain, or 1 as a placeholder.  None in saturated scenes."""
         if self._materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -453,7 +453,7 @@ class OnGrid(Keyed):
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the index of each point's part, and the number of parts."""
+        """Return the index of each point's connected part, and the number of these parts."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -512,7 +512,7 @@ class System:
 
 
 class Assembled(Keyed):
-    """Penalties and fluxes, which are reused until the next reset or stage. `loads`: loads at the last reset."""
+    """Penalties and fluxes, which steps reuse until the next reset or stage. `loads`: loads at the last reset."""
 
     def __init__(
         self,
@@ -560,7 +560,7 @@ class Assembled(Keyed):
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
-        """Return the rounding errors of the residual at the active local nodes, in N, from stiffness and penalties."""
+        """Return the rounding errors (N) of the residual at active local nodes, caused by stiffness and penalties."""
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
         of_cells[cells] = ROUND_OFF * on_grid.stiffness[cells] * grid.volumes(cells) / grid.sizes(cells).min(axis=-1)
@@ -582,7 +582,7 @@ class Assembled(Keyed):
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
         """Return the conditions on the fluid, and a function `outflow(begins)` that returns the fluxes at u.
 
-        If `begins` is True, invalid values raise ValueError.
+        If `begins` is True, this function raises ValueError for invalid values.
 
         `state`: state at the start of the step.
         `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.

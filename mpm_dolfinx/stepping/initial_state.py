@@ -102,7 +102,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
 
 
 def _warn_rain(scene: Scene, points: MaterialPoints, rains: Mapping[str, Rain]) -> None:
-    """Warn of implausible values of rain, and of rain on soil with suction that cannot take it up."""
+    """Warn of implausible values of rain, and of rain that soil with suction cannot take up."""
     materials, comm = scene.materials, scene.grid.comm
     most = max(np.inf if callable(m.conductivity) else np.max(m.conductivity) for m in materials.materials)
     for name, rain in rains.items():
@@ -197,8 +197,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. In the dictionary, keys
-    are names of point data. Values are ids of points, and the tractions at these points.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. The keys of the
+    dictionary are names of point data. Each value has the ids of points, and the tractions at them.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -361,7 +361,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that points of added bodies lack. Raise ValueError if `fields` lacks such data."""
+    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks any of these data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -428,7 +428,7 @@ def balanced(scene: Scene, state: State) -> State:
     Raises
     ------
     ValueError
-        No equilibrium exists with these laws.
+        No equilibrium exists with the laws of the scene.
     """
     forms, materials = scene.momentum, scene.materials
     try:

@@ -39,7 +39,7 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain, in cell sizes, without renewal. Source: definition."""
+"""Largest length of a domain, in cell sizes, that does not cause a renewal. Source: definition."""
 
 
 class Renewal:
@@ -185,7 +185,7 @@ class Renewal:
         ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
-            """Return means that stay within the range of the values and conserve their mass-weighted sum."""
+            """Return means of `values` that conserve their mass-weighted sum and stay within their range."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)

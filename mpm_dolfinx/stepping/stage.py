@@ -84,7 +84,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        A name is invalid, or two conditions have an equal name.
+        A name is invalid, or two conditions have the same name.
     """
     given = [getattr(one, "name", None) for one in conditions]
     for name, one in zip(given, conditions, strict=True):
@@ -194,11 +194,11 @@ class Stage:
             one.check_start(place)
 
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
-        """Return the initial values of point data that conditions store, for n points."""
+        """Return the point data of the conditions, with their initial values at n points."""
         return {data: rows for one in self.acting for of in one.kept(n).values() for data, rows in of.items()}
 
     def data_names(self, names: Collection[str]) -> set[str]:
-        """Return the names of the point data that the conditions named in `names` store."""
+        """Return the names of the point data of the conditions `names`."""
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
@@ -211,16 +211,16 @@ class Stage:
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces of conditions that depend on displacements since seeding. Their domains must not be replaced."""
+        """Faces whose domains must not be replaced: their conditions depend on displacements since seeding."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @cached_property
     def totals(self) -> Mapping[str, str]:
-        """Names of the time integrals since the start of the conditions, by the names of their integrands."""
+        """For each result with a time integral, by name: name of the integral since the start of the condition."""
         return VOLUMES | IMPULSES if self.inertia else VOLUMES
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return placeholders `value` for results of conditions before the first step, by quantity and name."""
+        """Return results of conditions before the first step, by quantity and name: `value` as a placeholder."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -235,7 +235,7 @@ class Stage:
     def initial_outcome(
         self, before: Stage, outcome: Outcome, value: float
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions at the beginning of the stage.  New conditions have the result `value`."""
+        """Return the results of conditions at the beginning of the stage.  New conditions have placeholders `value`."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()

@@ -108,7 +108,7 @@ class Trend:
         """Return the changes (n, ...) in a time `seconds` (s), by polynomial extrapolation.
 
         `implicit`: whether the rate at the end of this time replaces the mean rate.
-        `first`, s: length of a first substep, or 0. If > 0, `seconds` times the rate at its end is subtracted.
+        `first`, s: length of the first substep, or 0. If > 0, `seconds` times the substep's final rate is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)

@@ -74,7 +74,7 @@ class Space:
     """Space of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
     `old`: w at the start of the step.
-    `past`: part of the change of w in the step that the rate of the previous substep causes.
+    `past`: contribution of the previous substep's rate to the change of w in the step.
     `b`, `f`: residual and loads.
     `same`: copy of w that derivatives of forms treat as a constant.
     `u`, `p`: displacement and scaled pressure, the parts of w.
@@ -114,7 +114,7 @@ class BiotFEM:
     Parameters
     ----------
     grid
-        Mesh of the box-shaped body: a `Grid` with cells of equal size, which no other model uses.
+        Mesh of the box-shaped body: a `Grid` with cells of equal size.  No other model may use this grid.
     material, fluid
         `material`: skeleton whose law has no state variables and no local unknowns.  `fluid`: pore fluid, or None.
         With steep retention curves (n > 2.5, or with an air entry), steps may fail to converge.

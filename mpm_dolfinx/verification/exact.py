@@ -355,7 +355,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Return a function of arclength: x, y, rotation and moment of a rod with length and bending stiffness 1."""
+    """Return a function of arclength for x, y, rotation and moment of a rod with length 1 and bending stiffness 1."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 

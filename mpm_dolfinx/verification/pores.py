@@ -37,8 +37,8 @@ class Pores:
     def between(self, p0, p1):
         """Return the mean of k_r between the scaled pressures p0 and p1 as a UFL expression.
 
-        The mean is computed by Gauss quadrature over `retention.logarithm`.  If the quadrature were over the pressure,
-        all its points between a wet cell and a very dry cell would be dry.
+        The mean is computed by Gauss quadrature over `retention.logarithm`.  With quadrature over the pressure, all
+        quadrature points between a wet cell and a very dry cell would be dry.
         """
         if self.law is None:
             return 1.0
