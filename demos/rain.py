@@ -232,7 +232,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument(
         "--slope", type=int, default=0, help="cells over the height of a bank that fails, even; 0: no bank"
     )
-    parser.add_argument("--slide-step", type=float, default=0.02, help="step of the slide, s")
+    parser.add_argument("--slide-step", type=float, default=0.0125, help="step of the slide, s")
     o = parser.parse_args(argv)
     if o.cells < 5:
         parser.error(f"--cells {o.cells}: must be >= 5")
@@ -259,7 +259,7 @@ def main(argv: list[str] | None = None) -> dict:
             )
             print(f"errors: energy balance {of['energy']:.2%} of the weight's work, water balance {of['water']:.1e}")
             within = of["energy"] <= BALANCE and of["last_speed"] < REST and of["water"] < LEAKS
-            out["converged"] = bool(out["converged"] and (within or (o.slope, o.slide_step) != (10, 0.02)))
+            out["converged"] = bool(out["converged"] and (within or (o.slope, o.slide_step) != (10, 0.0125)))
     return out
 
 
