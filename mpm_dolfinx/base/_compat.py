@@ -147,7 +147,7 @@ class Timer:
 def expanded(form: ufl.Form) -> ufl.Form:
     """Return a form in which all derivatives are expanded.
 
-    Expansion may remove coefficients of a facet form, which dolfinx 0.9 packs, although its kernel omits them.
+    Expansion may remove coefficients from a facet form. Without it, dolfinx 0.9 packs coefficients that kernels omit.
     """
     return ufl.algorithms.expand_derivatives(form)
 

@@ -289,7 +289,7 @@ class Inflow(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Inflow, as volume at zero pressure, per current area and time.  The flux is finite, and negative for outflow.
+        Volume of fluid, at zero pressure, that enters per current area and time; finite, and negative for outflow.
     region : ((d,), (d,)), m
         Box of reference positions.  The condition acts inside this box only.
 

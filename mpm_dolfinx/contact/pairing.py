@@ -340,7 +340,7 @@ def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return face coordinates, and distances from x (m), of the points where lines from x along n cross faces."""
+    """Return the points where lines from x along n cross faces: their face coordinates, and distances from x in m."""
     if corners.shape[2] == 2:  # as in `Faces`, 2D faces have the width 1 along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

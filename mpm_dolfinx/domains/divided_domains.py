@@ -75,7 +75,7 @@ class SeededDomains:
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return body and lattice index (n, 1 + d) of seeded domains.
 
-        Domains of bodies without a lattice have the entry -1 - id in place of the body.
+        In bodies without a lattice, the entry -1 - (identifier of the domain) replaces the body.
         """
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)

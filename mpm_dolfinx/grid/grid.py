@@ -246,7 +246,7 @@ class Cells:
     partition
         The boxes of cells that the processes own.
     locals
-        Local index of each cell in all copies of the box (`Grid.copies`), or -1 if the cell is on another process.
+        Local index of each cell of all copies of the grid (`copies`), or -1 if the cell is on another process.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
@@ -801,7 +801,7 @@ class Grid:
         return fetch.back(values_at(fetch.send(new), node, store.send(rows)[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices (n, d + 1) of local cells (n,): one along each axis, and the index of the box's copy."""
+        """Return indices (n, d + 1) of local cells (n,) along each axis, and last the index of the copy (`copies`)."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 

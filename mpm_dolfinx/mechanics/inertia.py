@@ -136,7 +136,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
     The deformation gradients at the start, midpoint and end of the step are F_n, F = F_n + D and F_n + 2 D.
     The mean of the right Cauchy-Green tensors at the start and at the end is F^T F + D^T D.  Laws are evaluated at F~,
-    for which F~^T F~ is nearly this mean.  P is the first Piola-Kirchhoff stress:
+    for which F~^T F~ is nearly this mean.  The law gives the stress P(F~).  The step has the Piola-Kirchhoff stress P:
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 

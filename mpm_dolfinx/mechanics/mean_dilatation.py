@@ -215,7 +215,7 @@ class MeanDilatation:
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi to the tangent, without final assembly.
 
-        `sums`: for each law, the third result of `FBar.forms`: integrals (cells, quantities) over each cell.
+        `sums`: for each law, integrals (cells, quantities) over each cell, see the third result of `FBar.forms`.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(

@@ -238,7 +238,7 @@ class MomentumForms:
         return [] if some else [NONE] * len(self.law_forms)
 
     def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
-        """Set theta and pi at u.  Return the stresses and local unknowns that the forms of each law need."""
+        """Set theta and pi of F-bar at u.  Return stresses and local unknowns that the forms of each law need."""
 
         motion = self._motion
 

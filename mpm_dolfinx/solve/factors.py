@@ -39,7 +39,7 @@ def direct_solver(
     """Return a solver that factorises A at the first solve and after changes of A.
 
     `symmetric`: whether the factors are L D L^T; otherwise they are L U.
-    `gathered`: whether only the last process has the factors, for many solves with the same matrix.
+    `gathered`: whether only the last process has the factors.  This is faster if many systems have the same matrix.
     `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several processes.
     """
     if symmetric:

@@ -163,8 +163,8 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The fluid volumes of the step and of a first-order step differ by `seconds` times the change of the rates between
-    the substeps.  The inverse of the fixed-stress operator converts this difference into a pressure (Hosea and Shampine
+    After a first-order step, the fluid volumes would differ by `seconds` times the change of the outflow between the
+    substeps.  The inverse of the fixed-stress operator converts this difference into a pressure (Hosea and Shampine
     1996).  The estimated error is `ERROR` times this pressure, weighted by the filled fraction of the cell.
 
     `seconds`, s: time weight of the rates of the first substep.

@@ -95,7 +95,7 @@ class Trend:
     lengths : (k,)
         Lengths (s) of the steps, beginning with the last step.
     rates : (n, k, d (1 + d)), with fluid (n, k, d (1 + d) + 1)
-        Mean rates in each of these steps: of x (m/s), of F (1/s), and with fluid of the pressure (Pa/s).
+        Mean rates in each of these steps: of x (m/s), of F (1/s), and in scenes with fluid, of pressures (Pa/s).
     """
 
     lengths: NDArray[np.float64]
@@ -159,8 +159,8 @@ class State:
         Nodal velocities in the last step on this process, with ghosts. In scenes with yield or quasi-static contact,
         they give the initial guess of Newton's method. None before the first step, and in all other scenes.
     trend
-        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in all other
-        scenes, and after bodies were added.
+        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in scenes
+        without elastic bodies, and after bodies were added.
     held : (unknowns,), N
         Additional nodal forces on this process, with ghosts, for equilibrium at the start of a stage. None without such
         forces, and after a reset of the grid.
