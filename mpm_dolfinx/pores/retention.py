@@ -245,7 +245,7 @@ def scale_of(law) -> float:
             suction *= 2
         if half(suction):
             return suction
-    raise ValueError(f"{line(law)}: the saturation must fall to 0.5 at some suction, or the law must have an attribute `scale`, Pa")
+    raise ValueError(f"{line(law)}: saturation must fall to 0.5 at some suction, or the law must have a `scale`, Pa")
 
 
 class Retentions:

@@ -220,7 +220,7 @@ class Stage:
         return VOLUMES | IMPULSES if self.inertia else VOLUMES
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return placeholders, all equal to `value`, for results that the first step will compute, by quantity and name."""
+        """Return placeholders `value` for results that the first step will compute, by quantity and name."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
