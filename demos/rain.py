@@ -44,7 +44,7 @@ DAY = 86400.0  # s
 TIMES = (0.25, 0.5, 1.0, 2.0, 20.0)  # days
 BANK, BANK_ANGLE, CREST, RANGE = 5.0, np.radians(60.0), 3.0, 11.0  # m, -, m, m
 RAIN, LONGEST = 6e-5, 60e3  # m/s; longest time until failure, s
-SLIDES, MOVES, REST = 6.0, 0.2, 0.05  # duration of the slide, s; smallest displacement in it, m; speed at rest, m/s
+SLIDES, MOVES, REST = 7.0, 0.2, 0.05  # duration of the slide, s; smallest displacement in it, m; speed at rest, m/s
 LEAKS = 2e-8  # allowed error of the water balance, relative to the water in the bank
 BALANCE = 0.01  # allowed error of the energy balance, relative to the work of the weight
 
