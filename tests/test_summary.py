@@ -57,7 +57,7 @@ def test_what_is_left_out_is_not_compiled():
     sealed.step(0.01)
     assert drained.scene.storage is None
     momentum, fluxes = drained.scene.momentum, sealed.scene.storage.fluxes
-    assert momentum.dilatation is None and momentum.weight is None
+    assert momentum.dilatation is None and not momentum.acting
     assert not momentum.conditions.made
     assert not momentum.ghost.form.used and fluxes.flux is None and fluxes.gravity is None
 
