@@ -128,7 +128,7 @@ BLOCKS = {  # soil, cells, step, m, steps, most iterations
     "nu = 0.499": (mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7), 14, 0.01, 2, 30),
     "nu = 0.49, layers 1 : 1000": (LAYERED, 14, 0.01, 2, 25),
     "beyond the limit load": (FRICTIONAL, 12, 0.005, 10, 25),
-    "beyond the limit load, finer": (FRICTIONAL, 24, 0.005, 4, 45),
+    "beyond the limit load, finer": (FRICTIONAL, 24, 0.005, 4, 60),
 }
 
 
