@@ -31,6 +31,7 @@ simulation = mpm.Simulation(
     pressure=mpm.hydrostatic(2.5),
     initial_stress=mpm.K0(0.5),
 )
+# with dt = 1 s no water moves in a trial: undrained failure
 before = mpm.factor_of_safety(simulation, dt=1.0, rtol=0.02).factor
 simulation.run(t_end=24 * HOUR, dt=4 * HOUR)
 after = mpm.factor_of_safety(simulation, dt=1.0, rtol=0.02).factor
