@@ -318,8 +318,8 @@ class Rain(Flux):
 
     `Simulation.outflows` contains the flow through the side, and `outcome("runoff")` the run-off, in m^3/s (m^2/s in
     plane strain).  These outcomes are accumulated volumes since the start of the condition, in m^3 (m^2 in plane
-    strain): "flowed" (outflow), "rained" (rain), "ran_off" (run-off and seepage), and "ponded" (the pond).  "rained"
-    plus "flowed" equals "ran_off" plus "ponded".
+    strain): "flowed" (outflow), "rained" (rain less potential evaporation), "ran_off" (run-off and seepage), and
+    "ponded" (the pond).  "rained" plus "flowed" equals "ran_off" plus "ponded".
 
     Parameters
     ----------
