@@ -119,12 +119,12 @@ class Motion:
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 followed = cut.followed(nodal, on_grid.active.contains, not state.stage.inertia)
-                points, keeps, folded = self._shaped(state, loads, on_grid, followed, deformed)
+                points, keeps, inverted = self._shaped(state, loads, on_grid, followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
                 points = state.points.strained(F, x=x, corners=corners)
-                keeps, folded = on_grid.valid(cut.crossed(points), loads), 0
+                keeps, inverted = on_grid.valid(cut.crossed(points), loads), 0
             self._check_volumes(points, cut)
             if carried is not None:
                 part, count = on_grid.parts
@@ -162,11 +162,11 @@ class Motion:
         if report is not None:
             report.first = np.multiply(report.first, again)
         if not any(again):
-            return replace(state, **new, stay=Stay(cut.points)), folded
+            return replace(state, **new, stay=Stay(cut.points)), inverted
         if carried is not None:
             new["pieces"] = self._left(carried, points, state.stage, t, on_grid, some)
         kept = {name: self._kept(getattr(state, name), on_grid, keeps) if some else None for name in ("held", "rest")}
-        return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), folded
+        return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), inverted
 
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
         """Return the rates of the points in the last steps (at most three), including this step."""
@@ -288,7 +288,7 @@ class Motion:
         F of elastic points follows from the corners of their domains. F of yielded points is the result of `deformed`.
         """
         cut, stage = on_grid.cut, state.stage
-        grid, folded = cut.grid, 0
+        grid, inverted = cut.grid, 0
         moved, bend = followed
         own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
@@ -307,8 +307,8 @@ class Motion:
             crossed = np.add.reduce(crossed, axis=2) * ~evolved[:, None]
             corners = corners + free * filtered(grid, stage.lattices, points, crossed)
             bad = ~keeps & tangled(corners, points.volume0 * points.J, grid.axisymmetric)
-            folded = over_all(grid.comm, int(bad.sum()))
-            if folded:
+            inverted = over_all(grid.comm, int(bad.sum()))
+            if inverted:
                 corners = untangled(points, corners, bad, deformed(), grid, loads)
                 for one in loads:
                     corners[bad] = one.outside(corners[bad], own[bad], everywhere=True)
@@ -320,7 +320,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return points.strained(F, corners=corners, x=centroids(corners)), keeps, folded
+        return points.strained(F, corners=corners, x=centroids(corners)), keeps, inverted
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask of displacement components of corners that are neither prescribed nor fixed by walls."""
