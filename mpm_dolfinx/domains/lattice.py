@@ -172,9 +172,7 @@ def _at_sites(
         field[at] = d
     count = np.maximum(sum(np.bincount(at, minlength=len(field)) for at, _ in rows), 1)
     for column in range(values.shape[1]):  # the mean of equal values is exact
-        here = field[:, column].copy()
-        off = sum(sum_by(at, d[:, column] - here[at], len(field)) for at, d in rows)
-        field[:, column] = here + off / count
+        field[:, column] += sum(sum_by(at, d[:, column] - field[at, column], len(field)) for at, d in rows) / count
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]

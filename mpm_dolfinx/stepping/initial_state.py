@@ -107,7 +107,7 @@ def _warn_rain(scene: Scene, points: MaterialPoints, rains: Mapping[str, Rain]) 
     most = max(np.inf if callable(m.conductivity) else np.max(m.conductivity) for m in materials.materials)
     for name, rain in rains.items():
         if not callable(rain.flux) and rain.flux > max(HEAVIEST, 1000 * most):
-            what = "%s: flux = %.3g m/s, more than any rain, and 1000 times the conductivity; 1 mm/day is 1.16e-8 m/s"
+            what = "%s: flux = %.3g m/s, above any rain, and above 1000 times the conductivity; 1 mm/day is 1.16e-8 m/s"
             warn(comm, ConditionWarning, what, name, rain.flux)
         full = materials.retentions is None and not materials.drains
         if full and over_all(comm, float(points.pressure.min(initial=0.0)), MPI.MIN) < 0:

@@ -114,7 +114,9 @@ class Trend:
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
         if first:
             powers = powers - seconds / first * (first / last) ** order * order
-        shares = dgesv((ends**order).T, powers)[2]
+        *_, shares, singular = dgesv((ends**order).T, powers)
+        if singular:  # two steps have the same end, to rounding
+            raise np.linalg.LinAlgError("Trend: lengths of steps differ by too many orders of magnitude")
         weights = -self.lengths * shares[::-1].cumsum()[::-1]
         return np.add.reduce(self.rates * weights[:, None], axis=1)
 
