@@ -80,7 +80,7 @@ WANTED = {  # number, and relative tolerance
     "retaining_wall": (retaining_wall(), 0.03),
     "seepage": (86400 * 1e-6 * (8**2 - 2**2) / 20, 0.015),  # Dupuit and Charny
     "sliding_blocks": (0.3, 0.005),  # its coefficient
-    "slope_in_rain": (1.52, 0.05),  # cells and steps of half the size
+    "slope_in_rain": (1.57, 0.05),  # cells and steps of half the size
     "slope_stability": (1.368, 0.03),  # the best log-spiral mechanism
     "t_bar": (4 * np.sqrt(2) + 2 * np.pi, 0.03),  # Randolph and Houlsby
     "tool_from_stl": (0.8 * 0.6 * 0.4 * 0.6 * 2650 * 9.81 / 1000, 1e-3),  # volume times unit weight, kN
@@ -172,7 +172,7 @@ def test_the_landslide_loses_what_its_weight_gives_up():
 def test_rain_soaks_into_the_slope_and_weakens_it():
     printed, variables, _ = ran("slope_in_rain")
     after, before = map(float, re.findall(r"\d\.\d+", printed))
-    assert 1.82 == pytest.approx(before, rel=0.05) and after < 0.9 * before  # cells of half the size
+    assert 2.00 == pytest.approx(before, rel=0.05) and after < 0.9 * before  # cells of half the size
     s = variables["simulation"]
     fallen = 4e-6 * 24 * 3600 * (6 + np.hypot(8, 5) + 6)  # m^2, onto crest, slope and foot
     infiltrated, ran_off = -sum(s.outcome("flowed").array), sum(s.outcome("ran_off").array)

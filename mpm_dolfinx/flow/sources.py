@@ -22,13 +22,15 @@ class Sources(Feeding):
 
     `sources`: user functions that return UFL terms.
     `pieces`: quadrature points of all pieces.
-    `p`: pore pressure of the cells (DG0), Pa.
+    `p`, `p_n`: present pore pressure of the cells (DG0), and pressure at the start of the step, Pa.
     `t`, s: time at the end of the substep, a UFL constant.
     """
 
     title = "sources"
 
-    def __init__(self, sources: Sequence[Callable], pieces: FormPoints, p: fem.Function, t: fem.Constant):
+    def __init__(
+        self, sources: Sequence[Callable], pieces: FormPoints, p: fem.Function, p_n: fem.Function, t: fem.Constant
+    ):
         Q = p.function_space
         q, one = ufl.TestFunction(Q), fem.Function(Q)
         one.x.array[:] = 1.0
@@ -36,7 +38,7 @@ class Sources(Feeding):
         self.count = len(sources)
         self._forms, self._slopes = [], []
         for source in sources:
-            gain = form("sources", source, points=pieces, q=q, p=p, t=t)
+            gain = form("sources", source, points=pieces, q=q, p=p, p_n=p_n, t=t)
             if len(gain.arguments()) != 1:
                 raise ValueError(f"sources: {line(source)} does not depend on q, must be linear in q")
             if p in gain.coefficients():

@@ -37,6 +37,8 @@ q
     Test function, constant in the cells.  The source is `s * q * points.dx` with s in 1/s.
 p
     Pore pressure, Pa, constant in the cells.
+p_n
+    Pore pressure at the start of the step, Pa, constant in the cells.
 """
 
 from __future__ import annotations

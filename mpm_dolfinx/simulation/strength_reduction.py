@@ -23,8 +23,11 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
+from dolfinx import fem
 from numpy.typing import NDArray
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -106,9 +109,10 @@ def factor_of_safety(
     simulation
         Scene with its loads, which keep their present values.
     dt
-        Length of a step, in s, > 0.  The step must be long compared with viscous time scales of laws and terms.  If
-        fluid flows, `dt` is required.  Choose a short step for undrained failure, and a long step for drained failure.
-        Rain goes on during the steps of a trial, so the pore pressures change unless the steps are short.
+        Length of a step, in s, > 0.  Default: if fluid flows in the scene, pore pressures keep their present values.
+        With a given length, fluid flows in the trials too: a short step leads to undrained failure, and a long step to
+        drained failure at the final pore pressures.  Rain then goes on too.  The step must be long compared with
+        viscous time scales of laws and terms.
     rtol
         Final relative difference of the bounds, in [1e-4, 0.5].
     steps
@@ -128,8 +132,7 @@ def factor_of_safety(
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
     if simulation.state.stage.inertia:
         raise ValueError("factor_of_safety: bodies have inertia, must be quasi-static: stage(inertia=False)")
-    if dt is None and simulation.scene.flows:
-        raise ValueError("dt = None, must be given in s if fluid flows: short for undrained, long for drained failure")
+    held = dt is None and simulation.scene.flows
     positive = {"allowed": "> 0 and finite", "test": lambda v: (0 < v) & (v < np.inf)}
     dt, steps = float(numbers("dt", 1.0 if dt is None else dt, **positive)), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
@@ -138,7 +141,7 @@ def factor_of_safety(
     overloads = {}
     least = LACKS * rtol
     with _Bar(progress and comm.rank == 0) as bar:
-        weakened = _Weakened(simulation, dt, steps, least)
+        weakened = _Weakened(simulation, dt, steps, least, held)
 
         def rests(factor: float) -> bool:
             overloads[factor] = weakened.overloads(factor, lambda *now: bar.show(factor, *now))
@@ -224,7 +227,7 @@ class _Trial:
 class _Weakened:
     """Copy of a scene with variable strength and with a viscous stress."""
 
-    def __init__(self, simulation: Simulation, dt: float, steps: int, least: float):
+    def __init__(self, simulation: Simulation, dt: float, steps: int, least: float, held: bool):
         scene = simulation.scene
         self._dt = dt
         self._steps = steps
@@ -245,6 +248,13 @@ class _Weakened:
 
         materials = [_as_fields(m) for m in scene.materials.materials]
         terms, sources = scene.extensions
+        if held:  # sources keep the pressures, and no fluid flows
+            eps = np.finfo(float).eps
+            materials = [replace(m, conductivity=eps**2, conductivity_law=None) for m in materials]
+            moduli = scene.materials.table(initial.points, lambda m: m.oedometric)
+            stiffness = over_all(scene.grid.comm, float(moduli.min(initial=np.inf)), MPI.MIN)
+            supply = fem.Constant(scene.grid.mesh, 1 / (np.cbrt(eps) * stiffness * dt))
+            sources = [*sources, lambda points, q, p, p_n: supply * (p_n - p) * q * points.dx]
         self._scene = Scene(
             scene.grid,
             scene.bodies,

@@ -124,7 +124,7 @@ class Scene:
             if moves is not None:
                 inertial = moves.moved, -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
             pieces = self.pieces.pieces
-            feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
+            feeding = [Sources(sources, pieces, p.now, p.start, self.t)] if sources else []
             of_fluid = (scene, weight, symmetric, feeding, inertial)
             self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
         keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
