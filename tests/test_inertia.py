@@ -195,6 +195,14 @@ def test_stages_begin_and_end_inertia_with_forces_in_balance():
     assert np.abs(s.points.x - settled).max() < 1e-3 * (10 - settled.max())
 
 
+@pytest.mark.parametrize("steps", [{"dt": 0.5}, {"rtol": 1e-3}])
+def test_a_stage_without_inertia_takes_the_steps_of_a_scene_without_inertia(steps):
+    """Without fluid, such a stage has no time derivatives, so steps have one substep."""
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
+    never, later = (column(now, conditions=[load]).run(1.0, progress=False, **steps) for now in (None, False))
+    assert (later.steps, later.newton) == (never.steps, never.newton)
+
+
 PLATE = mpm.Tool(mpm.HalfSpace((0, 10), (0, -1)), displacement=lambda t: (0, -0.02 * min(t, 1)))
 
 

@@ -21,7 +21,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.state import StepControl
+from mpm_dolfinx.stepping.state import State, StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Shortest length of a step, divided by its nominal length: first for equal steps, then for adaptive steps.
@@ -299,7 +299,7 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
     return 1 / fastest**0.5 if fastest > 0 else inf
 
 
-def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points: MaterialPoints) -> StepSize:
+def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, state: State) -> StepSize:
     """Return the rule for the steps of a run.  Raise ValueError if arguments of the run are invalid."""
     if rtol is None:
         return StepSize(times.interval, times.interval)
@@ -310,12 +310,12 @@ def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points:
     if scene.numerics.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, the method must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
-    inertia = scene.momentum.inertia is not None
+    points, inertia = state.points, state.stage.inertia
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         why = "without flow of fluid, velocities have no error estimate"
         raise ValueError(f"rtol = {line(rtol)}, must be left out: {why}")
     first = times.after(times.start)[0] - times.start
-    if len(scene.substeps) > 1:  # a scene without time derivatives has no pressure error in time
+    if len(scene.substeps(state.stage)) > 1:  # a scene without time derivatives has no pressure error in time
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
     if inertia:  # bodies may be released or loaded suddenly

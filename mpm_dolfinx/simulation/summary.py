@@ -103,7 +103,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
             "the tangent depends on the strain",
         ),
         Part("linear solvers", True, str(s.last[1].plan) if s.last[1] else "planned in the first step"),
-        _either("second substep", len(s.substeps) > 1, "second order in time", once),
+        _either("second substep", len(s.substeps(state.stage)) > 1, "second order in time", once),
     ]
 
 

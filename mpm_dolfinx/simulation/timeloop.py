@@ -149,7 +149,7 @@ def run(
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     state = simulation.scene.followed(simulation.state)  # the first step depends on the size of the cells
-    rule = step_rule(times, rtol, simulation.scene, state.points)
+    rule = step_rule(times, rtol, simulation.scene, state)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
     events = Events(simulation, until)
@@ -346,7 +346,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
     After a jump of the loads, SDIRK2 may fail: it overshoots, and the soil may be too weak for the overshoot.
     """
-    if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
+    if isinstance(failed, LeftGrid) or len(simulation.scene.substeps(simulation.state.stage)) == 1:
         return None
     try:
         found = simulation.advanced(dt, EULER)

@@ -157,11 +157,9 @@ class Scene:
         """Whether the scene has user-defined terms or sources."""
         return any(map(len, self.extensions))
 
-    @property
-    def substeps(self) -> tuple[Substep, ...]:
-        """Substeps of each step."""
-        evolves = self.flows or self.momentum.own.rates or self.momentum.inertia is not None
-        return substeps(self.numerics.method, evolves)
+    def substeps(self, stage: Stage) -> tuple[Substep, ...]:
+        """Return the substeps of each step of a stage."""
+        return substeps(self.numerics.method, self.flows or self.momentum.own.rates or stage.inertia)
 
     def balance(
         self,

@@ -23,13 +23,13 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     scene.check(state)
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
-    stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
+    how = how or scene.substeps(state.stage)
+    stage, times = state.stage, [state.t + substep.end * dt for substep in how]
     start, *gravity = [stage.gravity_at(t) for t in [state.t, *times]]
     if dt > 0:
         scene.look_at([start, *gravity])
     state, renewed = scene.for_reset(scene.followed(state), dt > 0)
-    cut_points = state.as_cut
-    on_grid = scene.on_grid(cut_points)
+    on_grid = scene.on_grid(cut_points := state.as_cut)
     on_grid.cut.surfaces(stage.surfaces)  # all faces are cut together
     data = on_grid.data_of(state)
     now = state.t, dt, state.t, state.outcome, stage.inertia, state.begins
@@ -41,7 +41,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
     scene.momentum.u.x.array[scene.momentum.active.now.dofs] = 0.0
     due = on_grid.start(state)
-    acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
+    acting = [Acting(*one) for one in zip(how, times, loads, gravity, strict=True)]
     return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed, due)
 
 
