@@ -38,6 +38,9 @@ With non-associated flow the solution is not unique (Rudnicki and Rice 1975). Sh
 steps, and on fine grids many steps are cut. The option --viscosity adds a small viscous stress, which makes the
 solution unique (Needleman 1988). With --explicit-friction, friction follows from the mean stress at the start of each
 step. Flow is then associated within the step (Krabbenhoft, Karim, Lyamin and Sloan 2012).
+
+With --speed, the soil is dry and has inertia. The footing moves with this fraction of the velocity of shear waves. With
+a speed of 0, the soil is dry, without inertia.
 """
 
 from __future__ import annotations
@@ -69,6 +72,7 @@ SOIL = mpm.DruckerPrager(
 OF_SOIL = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)}
 WATER = mpm.Fluid()
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
+SHEAR_WAVES = (SHEAR / ((1 - SOIL.porosity) * SOIL.grain_density)) ** 0.5  # their velocity in dry soil, m/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-3}  # V
 COLOURS = ("C0", "C1", "C2")  # one for each rate
 STEP = 1 / 14  # fraction of a cell that the footing moves in a step
@@ -200,6 +204,7 @@ def push(
     circular: bool = False,
     method: str = "sdirk2",
     graded: bool = False,
+    speed: float = 0.0,
 ) -> Push:
     """Push the footing.
 
@@ -212,6 +217,7 @@ def push(
     circular: whether the footing is a disc of diameter B instead of a strip.
     method: time integration, see `Numerics`.
     graded: whether cells become larger away from the footing.
+    speed: velocity of the footing divided by that of shear waves in dry soil. If positive, the soil has inertia.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
@@ -222,16 +228,18 @@ def push(
         lines = mpm.graded(*size.values(), [[[0, -deep], [wide, air * h]]], h, RATIO, LARGEST * h)
         grid = mpm.Grid(lines=lines, axisymmetric=circular)
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
-    end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
+    velocity = CV * rate / WIDTH if rate else speed * SHEAR_WAVES or depth * WIDTH  # m/s
+    end, edge = depth * WIDTH / velocity, WIDTH / 2
     # the drained part of the top begins at the outermost node of the footing
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under, name="footing")
     sides, water = [footing], {}
     if rate:
         sides.append(mpm.Drained("top", region=beside))
-        water = {"fluid": WATER, "numerics": mpm.Numerics(method=method)}
+        water = {"fluid": WATER}
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=sides, **water)
+    how = {"numerics": mpm.Numerics(method=method), "inertia": True if speed else None} | water
+    simulation = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=sides, **how)
     out = Push()
 
     def observe(s: mpm.Simulation) -> None:
@@ -320,6 +328,8 @@ def main(argv: list[str] | None = None) -> dict:
     how.add_argument("--viscosity", type=float, default=0.0, help=what)
     what = "with --steps: friction from the mean stress at the start of each step"
     how.add_argument("--explicit-friction", action="store_true", help=what)
+    what = "with --steps: velocity of the footing, divided by that of shear waves; the soil is dry, with inertia if > 0"
+    how.add_argument("--speed", type=float, help=what)
     parser.add_argument(
         "--graded", action="store_true", help="only the undrained limit load, in a large box of graded cells"
     )
@@ -335,8 +345,11 @@ def main(argv: list[str] | None = None) -> dict:
         parser.error(f"--steps {o.steps}: must be >= 1; --box {o.box:g}: must be in [1, 32]")
     if not 0 <= o.viscosity <= 1:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
-    if o.steps is None and (o.box, o.method, o.viscosity, o.explicit_friction) != (BOX[0], methods[0], 0.0, False):
-        parser.error("--box, --method, --viscosity, --explicit-friction: must go with --steps")
+    if o.speed is not None and not 0 <= o.speed < 1:
+        parser.error(f"--speed {o.speed:g}: must be in [0, 1)")
+    only = o.box, o.method, o.viscosity, o.explicit_friction, o.speed
+    if o.steps is None and only != (BOX[0], methods[0], 0.0, False, None):
+        parser.error("--box, --method, --viscosity, --explicit-friction, --speed: must go with --steps")
     if o.steps is None and not o.square:
         parser.refuse_processes(" without --steps or --square")
     with common.results(o) as out:
@@ -348,7 +361,7 @@ def main(argv: list[str] | None = None) -> dict:
             out |= of_many_sizes(o.cells, o.out)
             return out
         if o.steps is not None:
-            out |= effort(o.cells, o.depth, o.steps, o.box, o.method, o.viscosity, o.explicit_friction)
+            out |= effort(o.cells, o.depth, o.steps, o.box, o.method, o.viscosity, o.explicit_friction, o.speed)
             return out
         stiff = {(how, cells): limit_load(how, cells) for how in LIMITS_OF for cells in (o.cells, 2 * o.cells - 1)}
         out["errors"] = errors(stiff)
@@ -415,15 +428,24 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
 
 
 def effort(
-    cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0, explicit: bool = False
+    cells: int,
+    depth: float,
+    steps: int,
+    width: float,
+    method: str,
+    viscosity: float = 0.0,
+    explicit: bool = False,
+    speed: float | None = None,
 ) -> dict:
-    """Push at the intermediate rate in equal steps, and print and return load, numbers of steps, and processor time.
+    """Push in equal steps, and print and return load, numbers of steps, and processor time.
 
     width: width of the computed half of the soil, divided by B.
+    speed: see `push`; the soil is then dry. With None, saturated soil is pushed at the intermediate rate.
     """
     began, rate = time.process_time(), RATES["intermediate"]
     soil = ExplicitFriction(**OF_SOIL) if explicit else viscous(viscosity, depth * WIDTH**2 / (CV * rate))
-    run = push(soil, cells, depth, rate, box=(width, BOX[1]), steps=steps, method=method)
+    how = {"rate": rate} if speed is None else {"rate": None, "speed": speed}
+    run = push(soil, cells, depth, **how, box=(width, BOX[1]), steps=steps, method=method)
     found = {"points": run.results[0].points, "asked": steps, "load": run.load[-1]}
     found |= {count: run.total(count) for count in ("steps", "cuts", "newton")} | {"cpu": time.process_time() - began}
     if not common.first():

@@ -139,11 +139,19 @@ def test_a_square_footing_in_3d_tends_to_its_bounds_from_below_with_few_iteratio
     assert all(run["rise"] < 4e-3 and run["iterations"] < 6 * run["newton"] for run in (coarse, fine, smooth))
 
 
+def test_a_slow_push_with_inertia_carries_the_load_of_a_push_without():
+    """At a thousandth of the velocity of shear waves, inertia forces are small."""
+    still, moving = (footing.effort(11, 0.1, 5, 4.0, "sdirk2", speed=speed) for speed in (0.0, 1e-3))
+    assert still["cuts"] == moving["cuts"] == 0
+    assert moving["load"] == pytest.approx(still["load"], rel=1e-3)
+
+
 def test_options_that_would_change_nothing_without_steps_are_refused(capsys):
-    for option in ("--viscosity=0.1", "--box=4", "--method=backward-euler", "--explicit-friction"):
+    for option in ("--viscosity=0.1", "--box=4", "--method=backward-euler", "--explicit-friction", "--speed=0"):
         with pytest.raises(SystemExit):
             footing.main([option])
-        assert "--box, --method, --viscosity, --explicit-friction: must go with --steps" in capsys.readouterr().err
+        refused = "--box, --method, --viscosity, --explicit-friction, --speed: must go with --steps"
+        assert refused in capsys.readouterr().err
 
 
 @pytest.mark.slow
