@@ -10,6 +10,7 @@ from test_inertia import Bar
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.base.time_integration import GAMMA
+from mpm_dolfinx.contact.law import DEPTH
 from mpm_dolfinx.mechanics.inertia import velocity_gradients
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.stepping.balances import Balances
@@ -114,6 +115,30 @@ def test_forces_of_bars_that_strike_are_steady_in_short_steps():
         s.step(0.25 / n)
         force.append(abs(s.tool_forces.array[0, 0]) * n / speed)
     assert np.array(force)[30:] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("on", ["tool", "body"])
+def test_a_block_that_rests_on_contact_stays_in_steps_of_any_length(on):
+    """Static contact leaves a penetration. Earlier, a step removed it with the velocity of the penetration over dt.
+
+    This velocity was 1.3 m/s on a body, and .2 m/s on a tool. The bound is `DEPTH` times the wave velocity: a
+    penetration of `DEPTH` cells disappears while a wave crosses a cell.
+    """
+    soil, dt = mpm.Hencky(bulk=4e5, shear=2e5, grain_density=2000.0), 1e-5
+    grid = mpm.Grid([0, 0], [1.4, 1.2], [14, 12])
+    top = 0.33 if on == "tool" else 0.4
+    bodies = [mpm.box(grid, [0.23, top], [1.03, 0.79])]
+    below = [mpm.Tool(mpm.HalfSpace((0, top), (0, 1)))]
+    if on == "body":
+        bodies, below = [*bodies, mpm.box(grid, [0.13, 0], [1.13, top])], [mpm.Contact(0, 1)]
+    conditions = [*below, mpm.Displacement("left", (0, 0), "x", region=((0, 0.41), (2, 2)))]
+    options = {"walls": {"bottom": "xy"}, "gravity": (0, -G), "inertia": False, "conditions": conditions}
+    s = mpm.Simulation(grid, bodies, [soil], **options)
+    s.run(1.0, 0.5, progress=False)
+    s.stage(inertia=True)
+    s.step(dt)
+    wave = np.sqrt((4e5 + 4 / 3 * 2e5) / s.scene.materials.density(s.points)[0])
+    assert np.abs(s.points.data["velocity"]).max() < DEPTH * wave
 
 
 def incline(angle, aslant, friction=0.3, speed=0.0, n=4, length=0.5):

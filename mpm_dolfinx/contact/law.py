@@ -10,6 +10,10 @@ form a *condition*.  At a pair with gap g, the contact pressure p and its energy
 iteration, lambda is the pressure after the previous step.  Augmentation (Uzawa's method) updates lambda until the
 penetrated volume in each cell is below `DEPTH` cell volumes.
 
+With inertia, k contains the part k_i = `STIFF` rho h / (GAMMA dt)^2, which resists only the motion in the step.  The
+term k g is then k g - k_i min(0, g_0), with the gap g_0 at the start of the step.  Otherwise a short step would remove
+an earlier penetration, with the velocity g_0 / dt.
+
 Each condition has one shear traction t.  Radial return gives
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p).
@@ -115,7 +119,10 @@ class ContactLaw:
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
         self._modulus, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
-        self._stiffness = self._modulus + STIFF * of_pairs * pairs.inertia
+        inertial = STIFF * of_pairs * pairs.inertia
+        self._stiffness = self._modulus + inertial
+        self._sunk = np.where(inertial > 0, pairs.sunk, 0.0)
+        self._kept = inertial * self._sunk
         self.frictional = any(contact.frictional for contact in contacts)
 
     def begins(self) -> ContactState:
@@ -139,10 +146,11 @@ class ContactLaw:
     def touch(self, state: ContactState, at: Geometry) -> Touch:
         """Return the contact forces on the pairs, and the derivatives of these forces."""
         stiffness = self.stiffness(state)
-        push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
+        push = state.pressure[self.of] + state.updates[self.of, 0] * self._kept
+        push = np.maximum(0.0, push - stiffness * at.gap)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
         rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
-        touches = (push > 0) | (at.gap <= rounding)
+        touches = (push > 0) | (at.gap - self._sunk <= rounding)
         pressure = self.mean(push)
         on = np.zeros(len(self.area), dtype=bool)
         normal = self.mean(at.n)

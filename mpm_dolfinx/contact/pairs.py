@@ -59,6 +59,11 @@ class Pairs:
         raise NotImplementedError
 
     @property
+    def sunk(self) -> NDArray[np.float64]:
+        """Gap (m,) at the start of the step where it is negative, otherwise 0, in m."""
+        raise NotImplementedError
+
+    @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
         """Largest absolute value, in m, of the coordinates from which gaps are computed."""
         return self.grid.reach
@@ -83,6 +88,7 @@ class ToolPairs(Pairs):
     poses: Sequence[Pose]  # poses of tools at the end of the substep, without motion by loads in the step (contacts,)
     now: NDArray[np.float64]  # position of the point at the start of the step (m, d), m
     carried: NDArray[np.float64]  # position `now` after the motion of the tool (m, d), m
+    start_gap: NDArray[np.float64]  # gap at the start of the step (m,), m; 0 in statics
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
@@ -116,6 +122,11 @@ class ToolPairs(Pairs):
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
+    def sunk(self) -> NDArray[np.float64]:
+        """See `Pairs`."""
+        return np.minimum(0.0, self.start_gap)
+
+    @property
     def largest_coordinate(self) -> NDArray[np.float64]:
         """See `Pairs`."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
@@ -138,6 +149,11 @@ class FacePairs(Pairs):
         """See `Pairs`.  Lever arms refer to positions at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
+
+    @property
+    def sunk(self) -> NDArray[np.float64]:
+        """See `Pairs`."""
+        return np.minimum(0.0, np.einsum("md,md->m", self.n, self.offset))
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""

@@ -214,17 +214,20 @@ class Tools(Touching):
                 if tool.frictional
                 else np.zeros((len(at), d))
             )
-            vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
-            pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
-            scalars = [np.full(len(at), number), size[at], *stiffness[at].T, pressure]
+            own = before.own(x[at])
+            vectors = [x[at], pose.put(own), old @ (pose.R @ before.R.T).T]
+            pressure, gap = points.data[pressure_name(self.names[number])][patches.at[at]], np.zeros(len(at))
+            if place.rate:
+                gap = together(grid.comm, lambda tool=tool, own=own: tool.gap(own, grid.least))
+            scalars = [np.full(len(at), number), size[at], *stiffness[at].T, pressure, gap]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
-        number, *own = sent[:, :5].T
-        now, carried, shear = np.split(sent[:, 5:], 3, axis=1)
-        acts = np.ones(len(number)), self.tools, poses
-        pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts, now, carried)
+        number, *own, gap = sent[:, :6].T
+        now, carried, shear = np.split(sent[:, 6:], 3, axis=1)
+        acts = np.ones(len(number)), self.tools, poses, now, carried, gap
+        pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         return ContactLaw(self.names, self.tools, pairs), origin
 
