@@ -46,6 +46,22 @@ def test_after_a_reset_displacements_count_from_there():
     assert max(vertical(s).values()) < max(stress.values()), "the weight's stress is kept and the load's added"
 
 
+@pytest.mark.parametrize("inertia", [True, False])
+def test_a_stage_that_changes_nothing_is_no_stage(inertia):
+    """Earlier, it reset the grid: with inertia, velocities changed by .6 % in the next step."""
+    shear = mpm.Traction("top", (1.0, -1.0))
+    kept = {"walls": WALLS, "gravity": GRAVITY, "inertia": inertia}
+    found = []
+    for stages in ([], [{}, kept], [{"gravity": (0.0, -9.82)}]):
+        s, _ = blocks(conditions=[shear, mpm.Displacement("left", (0, 0), "x")], inertia=inertia)
+        s.run(0.02, 0.002, progress=False)
+        for changes in stages:
+            s.stage(**changes | {"conditions": s.conditions} if changes else {})
+        s.run(0.022, 0.002, progress=False)
+        found.append(s.points.x)
+    assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
+
+
 def test_what_a_load_did_to_an_elastic_body_goes_with_it():
     s, probe = blocks(conditions=[mpm.Traction("top", lambda t: (0, -1e4 * min(1, t)))], gravity=None)
     s.run(1.0, 0.5, probes=probe)

@@ -295,6 +295,7 @@ class Simulation:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
         Stresses and pressures do not change until the next `run`, which finds the new equilibrium.
+        If all arguments are the present values, the state does not change.
 
         Parameters
         ----------
@@ -327,7 +328,10 @@ class Simulation:
         """
         given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": inertia}
         named = {name: value for name, value in given.items() if value is not None}
-        self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
+        new = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
+        changes = len(add) + len(remove) + len(fields or {}) > 0 or reset_displacement
+        if changes or not new.stage.equals(self.state.stage):
+            self.state = new
 
     def step(self, dt: float) -> Report:
         """Advance by one step of length `dt`, in s, and return the report of the step.

@@ -209,6 +209,13 @@ class Stage:
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
+    def equals(self, before: Stage) -> bool:
+        """Return whether walls, gravity, inertia and all conditions are those of the stage `before`."""
+        if not all(np.array_equal(value, before.conditions[name]) for name, value in self.conditions.items()):
+            return False
+        now, then = ({name: id(one) for name, one in of.given.items()} for of in (self, before))
+        return now == then
+
     @property
     def lasting(self) -> list[Surface]:
         """Faces whose domains must not be replaced: their conditions depend on displacements since seeding."""
