@@ -302,6 +302,19 @@ def test_a_hammer_comes_back_as_fast_as_it_should():
     assert e["kinetic"][0] == pytest.approx(0.7 * 0.1 * 0.02**2 / 2)
 
 
+def test_steps_by_error_pass_a_strike():
+    """Exact: the tool has the velocity V exp(-t / M) until the wave returns.
+
+    The estimated error of a step with the strike does not decrease with its length, so steps became ever shorter. The
+    run gave up, because rounding errors counted as those of a longer, refused step. With inertia, the contact stiffness
+    is proportional to 1 / dt^2.
+    """
+    s = hammer(10)
+    s.run(0.4, rtol=1e-2, progress=False)
+    assert s.result.rejected > 0 and s.result.cuts == 0, "the strike is sudden"
+    assert s.outcome("tool_velocity").array[0][1] / -0.02 == pytest.approx(np.exp(-0.25 / 0.7), rel=0.03)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", [10, 20])
 def test_a_heavy_hammer_loses_at_most_the_energy_that_accelerates_half_a_cell(cells):

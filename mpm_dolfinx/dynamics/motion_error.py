@@ -28,8 +28,9 @@ def motion_error(
     The first substep ends with the velocity v1 and the acceleration a1, and the last substep with v2 and a2.  A
     first-order step would give a velocity that differs by `seconds * (a2 - a1)`, and a displacement that differs by
     `seconds * (v2 - v1)`.  The estimate is `ERROR` times the energy norm of these differences.  In a resolved mode of
-    angular frequency omega, the true error is 0.081 omega dt times this norm, with the step length dt.  In unresolved
-    modes, a linear solve with the matrix of the substep limits the estimate (Hosea and Shampine 1996).
+    angular frequency omega, the true error is 0.081 omega dt times this norm, with the step length dt.  `StepSize` uses
+    this bound in short steps.  In unresolved modes, a linear solve with the matrix of the substep limits the estimate
+    (Hosea and Shampine 1996).
 
     `K`, `mass`: momentum tangent and mass matrix of the last substep.
     `flights`: velocities and accelerations after the two substeps.

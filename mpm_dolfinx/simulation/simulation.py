@@ -37,7 +37,7 @@ from mpm_dolfinx.simulation.tangent import tangent
 from mpm_dolfinx.simulation.timeloop import run
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.distribution import distribute
-from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
+from mpm_dolfinx.stepping.initial_state import balanced, first_state, next_stage
 from mpm_dolfinx.stepping.result import OUTCOMES, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked, contacts_of
@@ -328,10 +328,7 @@ class Simulation:
         """
         given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": inertia}
         named = {name: value for name, value in given.items() if value is not None}
-        new = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
-        changes = len(add) + len(remove) + len(fields or {}) > 0 or reset_displacement
-        if changes or not new.stage.equals(self.state.stage):
-            self.state = new
+        self.state = next_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
     def step(self, dt: float) -> Report:
         """Advance by one step of length `dt`, in s, and return the report of the step.

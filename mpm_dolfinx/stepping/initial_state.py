@@ -192,6 +192,21 @@ def begin_stage(
     return replace(state, points=points, pieces=pieces, **new)
 
 
+def next_stage(
+    scene: Scene,
+    state: State,
+    named: Mapping[str, Any],
+    add: Sequence[int],
+    remove: Sequence[int],
+    reset_displacement: bool,
+    fields: Mapping[str, ArrayLike],
+) -> State:
+    """Return the result of `begin_stage`, or `state` itself if the stage changes nothing."""
+    new = begin_stage(scene, state, named, add, remove, reset_displacement, fields)
+    changes = len(add) + len(remove) + len(fields) > 0 or reset_displacement
+    return new if changes or not new.stage.equals(state.stage) else state
+
+
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:

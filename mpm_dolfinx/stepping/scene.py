@@ -331,11 +331,17 @@ class Scene:
         return replace(state, **new).at_owners(self.grid), count
 
     def assembled(
-        self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool
+        self,
+        on_grid: OnGrid,
+        stage: Stage,
+        now: Sequence[Loads],
+        as_cut: Callable[[], Sequence[Loads]],
+        begins: bool,
+        dt: float,
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
-        `now`: present loads.
+        `now`: present loads in a step of length `dt` (s).
         `as_cut`: function that returns the loads at the last reset.
         `begins`: whether this is the first step of a stage.  If so, all parts of the bodies must have supports.
 
@@ -357,7 +363,9 @@ class Scene:
                 return Assembled(self.momentum, self.storage, system, on_grid, stage, loads)
 
         grid = self.grid
-        return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, grid.comm)
+        inertia = self.momentum.inertia is not None
+        of_contact = dt if inertia and any(one.touches for one in now) else None  # rounding errors depend on dt
+        return self._assembled((on_grid.key, stage, of_contact, *(one.key for one in now)), make, grid.comm)
 
     def _system(
         self, on_grid: OnGrid, stage: Stage, dofs: NDArray[np.int32], loads: Sequence[Loads], begins: bool

@@ -38,7 +38,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     loads = joined([stage.placed(place._replace(t=t)) for t in times])
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
-    matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
+    matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins, dt), at_rest(scene, state, loads)
     scene.momentum.u.x.array[scene.momentum.active.now.dofs] = 0.0
     due = on_grid.start(state)
     acting = [Acting(*one) for one in zip(how, times, loads, gravity, strict=True)]
