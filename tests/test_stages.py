@@ -62,6 +62,18 @@ def test_a_stage_that_changes_nothing_is_no_stage(inertia):
     assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
 
 
+def test_results_of_a_wall_go_on_if_another_wall_changes():
+    """Earlier, reactions and impulses of all walls began anew."""
+    s, _ = blocks(inertia=True)
+    s.run(0.02, 0.002, progress=False)
+    before = s.outcome("wall_impulse")["bottom"]
+    s.stage(walls={**WALLS, "top": "y"})
+    assert np.array_equal(s.outcome("wall_impulse")["bottom"], before) and before[1] > 0
+    assert np.isfinite(s.wall_reactions["left"]).all() and np.isnan(s.wall_reactions["top"]).all()
+    s.run(0.022, 0.002, progress=False)
+    assert s.outcome("wall_impulse")["bottom"][1] > before[1]
+
+
 def test_what_a_load_did_to_an_elastic_body_goes_with_it():
     s, probe = blocks(conditions=[mpm.Traction("top", lambda t: (0, -1e4 * min(1, t)))], gravity=None)
     s.run(1.0, 0.5, probes=probe)

@@ -244,8 +244,8 @@ class Stage:
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the results of conditions at the beginning of the stage.  New conditions have placeholders `value`."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
-        if self.conditions["walls"] == before.conditions["walls"]:
-            same |= SIDES[self.free.shape[1]].keys()
+        now, then = self.conditions["walls"], before.conditions["walls"]
+        same |= {wall for wall in SIDES[self.free.shape[1]] if set(now.get(wall, "")) == set(then.get(wall, ""))}
         out = self.unknown(value)
         for quantity, values in out.items():
             kept = outcome.get(quantity, {})
