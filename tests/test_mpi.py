@@ -32,7 +32,7 @@ NAMES = (
     "following division shared shaken"
 )
 NAMES = NAMES.split()
-SCENES = [*((f"mpi_{name}.py", (3,)) for name in NAMES), ("mpi_tools.py meshes", (3,))]
+SCENES = [*((f"mpi_{name}.py", (3,)) for name in NAMES), ("mpi_tools.py meshes", (3,)), ("mpi_probes.py", (2,))]
 SLOW = [
     pytest.param(f"mpi_{name}.py", count, marks=pytest.mark.slow)
     for name, count in (("wetting", (3,)), ("rain", (2, 3, 4)), ("tied", (2, 3)), ("following_3d", (2,)))

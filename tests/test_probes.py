@@ -42,14 +42,23 @@ def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
 
 
 @pytest.mark.parametrize(
-    "dim, axisymmetric, off, lower, upper",
-    [(2, False, 0.0, 1e-6, 1e-4), (2, False, 0.3, 1e-4, 1e-6), (2, True, 0.3, 1e-6, 1e-4), (3, False, 0.3, 1e-6, 1e-4)],
-    ids=["plane", "off", "ring", "space"],
+    "dim, axisymmetric, off, lower, upper, below",
+    [
+        (2, False, 0.0, 1e-6, 1e-4, 2e4),
+        (2, False, 0.3, 1e-4, 1e-6, 2e4),
+        (2, True, 0.3, 1e-6, 1e-4, 2e4),
+        (3, False, 0.3, 1e-6, 1e-4, 2e4),
+        (2, False, 0.3, 1e-6, 1e-4, 0.0),
+        (2, False, 0.6, 1e-6, 1e-4, 0.0),
+    ],
+    ids=["plane", "off", "ring", "space", "peak", "peak between cells"],
 )
 def test_steady_flow_through_layers_is_exact_up_to_their_interface_and_drained_sides(
-    dim, axisymmetric, off, lower, upper
+    dim, axisymmetric, off, lower, upper, below
 ):
-    """The interface is within a cell. Water flows up, or down, against its weight."""
+    """The interface is within a cell, or between cells. Water flows up, or down, against its weight. The pressure has
+    its maximum at the interface, if none is prescribed below.
+    """
     n, h, meets = (8, 0.125, 0.55) if dim == 2 else (5, 0.2, 0.5)
     grid = mpm.Grid([0] * dim, [2 * h] * (dim - 1) + [1 + h], [2] * (dim - 1) + [n + 1], axisymmetric=axisymmetric)
     z, side = off * h, [2 * h] * (dim - 1)
@@ -61,14 +70,14 @@ def test_steady_flow_through_layers_is_exact_up_to_their_interface_and_drained_s
         [mpm.LinearElastic(**STIFF, conductivity=k) for k in (lower, upper)],
         walls=SIDES[dim],
         fluid=mpm.Fluid(bulk=np.inf),
-        conditions=[mpm.Displacement("bottom", [0] * dim, UP[dim]), mpm.Drained("top"), mpm.Drained("bottom", 2e4)],
+        conditions=[mpm.Displacement("bottom", [0] * dim, UP[dim]), mpm.Drained("top"), mpm.Drained("bottom", below)],
         gravity=[0] * (dim - 1) + [-9.81],
     )
     y = np.concatenate([np.linspace(0, meets - 1e-9, 9), np.linspace(meets + 1e-9, 1, 9)])
     places = np.column_stack([*[RANDOM.uniform(0, 2 * h, len(y))] * (dim - 1), z + y])
     found = s.run(1e4, 1e4, probes=mpm.probes(bodies, places), progress=False).probe_pressure[-1]
     resists = np.minimum(y, meets) / lower + np.maximum(y - meets, 0) / upper
-    head = 2e4 + (WEIGHT - 2e4) * resists / (meets / lower + (1 - meets) / upper)
+    head = below + (WEIGHT - below) * resists / (meets / lower + (1 - meets) / upper)
     assert found == pytest.approx(head - WEIGHT * y, abs=1e-6 * 2e4)
 
 

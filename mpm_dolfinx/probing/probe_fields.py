@@ -4,13 +4,17 @@
 The pressure at a probe is a weighted polynomial fit (`local_fit`) to the pressures of cells.  The fit uses cells of the
 same soil, at most three cells away.  Open faces must connect these cells to the cell of the probe.  The fit also uses
 pressures on drained sides, and on faces between cells of the fit and other cells.  Heads are fitted instead of
-pressures, so hydrostatic states are exact.  The fitted head is limited to the range of heads in the cell of the probe,
-in neighbouring cells and on drained sides.  Towards an undrained side, the gradient of the head extends this range.
+pressures, so hydrostatic states are exact.
+
+The fitted pressure is limited to the range of pressures in the cell of the probe, in the cells around it and on drained
+sides.  The head is limited likewise.  Towards an undrained side, the gradients of both extend these ranges.
 
 The stress at a probe is a fit to the stresses of material points.
 """
 
 from __future__ import annotations
+
+from itertools import product
 
 from mpi4py import MPI
 
@@ -163,7 +167,7 @@ class _Around:
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures at the probes, in Pa.  `weight` (d,): weight of the fluid per volume, in N/m^3."""
         comm, head = self._grid.comm, self._p - self._centroid @ weight
-        base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
+        base = head[:, self._lattice.middle]
         at, offset, value, share, own = self._drained(weight)
         rows = [(at, offset, value, share)]
         if comm.rank == 0:  # data that are equal on all processes are added once
@@ -174,38 +178,75 @@ class _Around:
         y = away / self._lattice.size[probe, self._lattice.middle]
         cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
         above = fitted(comm, len(base), 2, probe, y, (values - base[probe])[:, None], near(cells) * part)[:, 0]
-        least, most = (np.full(len(base), start) for start in (np.inf, -np.inf))
-        np.minimum.at(least, at[own], value[own])
-        np.maximum.at(most, at[own], value[own])
-        low, high = np.minimum(low, over_all(comm, least, MPI.MIN)), np.maximum(high, over_all(comm, most, MPI.MAX))
-        return np.clip(base + above, low, high)
+        out = base + above
+        for slope in (weight, 0 * weight):
+            low, high = self._bounds(head, slope)
+            side = value[own] + offset[own] @ slope
+            np.minimum.at(low, at[own], side)
+            np.maximum.at(high, at[own], side)
+            out = np.clip(out, over_all(comm, low, MPI.MIN), over_all(comm, high, MPI.MAX))
+        return out
 
-    def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a lower and an upper bound of the head at each probe, in Pa."""
-        i = self._lattice.middle
-        low, high = head[:, i].copy(), head[:, i].copy()
-        for axis in range(self._grid.dim):
-            stride, h = self._lattice.stride[axis], self._lattice.size[:, :, axis]
-            filled = {}
-            for sign in (-1, 1):
-                j = i + sign * stride
-                filled[sign] = self._filled[:, j] & (self._open[:, i, axis, (sign + 1) // 2] > 0)
-                filled[sign] &= self._open[:, j, axis, (1 - sign) // 2] > 0
-                low = np.where(filled[sign], np.minimum(low, head[:, j]), low)
-                high = np.where(filled[sign], np.maximum(high, head[:, j]), high)
-            for sign in (-1, 1):
-                j, k = i - sign * stride, i - 2 * sign * stride
-                to, before = (
-                    (head[:, a] - head[:, b])
-                    / np.maximum(sign * (self._centroid[:, a, axis] - self._centroid[:, b, axis]), h[:, i] / 2)
-                    for a, b in ((i, j), (j, k))
-                )
-                before = np.where(self._counts[:, k], van_leer(np.stack([to, before], axis=1)), to)
-                on = np.where(before * to > 0, np.sign(to) * np.minimum(np.abs(before), np.abs(2 * to - before)), 0.0)
-                on = on * np.maximum(-sign * self._centroid[:, i, axis], 0)
-                on[~(self._counts[:, i] & self._counts[:, j] & filled[-sign] & ~filled[sign])] = 0.0
-                low, high = low + np.minimum(on, 0), high + np.maximum(on, 0)
-        return low, high
+    def _bounds(
+        self, head: NDArray[np.float64], slope: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return a lower and an upper bound of the pressure at each probe, in Pa.
+
+        The bounds are the range of values in the cell of the probe and in the cells around it, also diagonally.  For a
+        cell that is missing or outside the fit, differences along the axes are added to the value in the cell of the
+        probe.  Along an axis without a cell of the fit, this difference is hydrostatic, or follows the gradient.  If
+        the cell of the probe is not in the fit, only heads have bounds, because pressures may have a kink.
+
+        `head` (n, cells), in Pa: pressures of cells, extended hydrostatically to the probe.
+        `slope` (d,), in Pa/m: hydrostatic gradient to limit the pressure, or zero to limit the head.
+        """
+        i, strides = self._lattice.middle, self._lattice.stride
+        centroid = self._centroid - self._centroid[:, i : i + 1]
+        value = head + self._centroid @ slope
+        known = self._filled & (self._counts if slope.any() else True)
+        least, most = {}, {}
+        for axis, sign in product(range(self._grid.dim), (-1, 1)):
+            j = i + sign * strides[axis]
+            filled = self._leads(i, axis, sign)
+            distance = np.maximum(-sign * self._centroid[:, i, axis], 0)  # from the centroid to the probe
+            hydrostatic = sign * distance * slope[axis]
+            linear = hydrostatic + distance * self._gradient(head, axis, sign)
+            change = filled * (head[:, j] - head[:, i] + centroid[:, j, axis] * slope[axis])
+            ends = np.stack([0 * change, change, *np.where(filled & known[:, j], 0.0, [hydrostatic, linear])])
+            least[axis, sign], most[axis, sign] = ends.min(axis=0), ends.max(axis=0)
+        low, high = np.zeros((2, len(value)))
+        connected = {}
+        for step in sorted(product((-1, 0, 1), repeat=self._grid.dim), key=np.count_nonzero):
+            j, moved = i + strides @ step, [(axis, sign) for axis, sign in enumerate(step) if sign]
+            connected[step] = np.full(len(value), not moved)
+            for axis, sign in moved:
+                before = (*step[:axis], 0, *step[axis + 1 :])
+                connected[step] |= connected[before] & self._leads(j - sign * strides[axis], axis, sign)
+            change, unknown = connected[step] * (value[:, j] - value[:, i]), ~(connected[step] & known[:, j])
+            low = np.minimum(low, np.minimum(change, unknown * sum(least[one] for one in moved)))
+            high = np.maximum(high, np.maximum(change, unknown * sum(most[one] for one in moved)))
+        limited = known[:, i] | (not slope.any())
+        return value[:, i] + np.where(limited, low, -np.inf), value[:, i] + np.where(limited, high, np.inf)
+
+    def _leads(self, cell: int, axis: int, sign: int) -> NDArray[np.bool_]:
+        """Return whether the next cell along an axis is filled, and connected to a cell of each block."""
+        other, end = cell + sign * self._lattice.stride[axis], (sign + 1) // 2
+        is_open = (self._open[:, cell, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
+        return self._filled[:, other] & is_open
+
+    def _gradient(self, head: NDArray[np.float64], axis: int, sign: int) -> NDArray[np.float64]:
+        """Return the gradient of the head, in Pa/m, in the cell of each probe towards a side.
+
+        The gradient is zero if the head is not monotone, or if the opposite neighbour is not in the fit.
+        """
+        i, back = self._lattice.middle, -sign * self._lattice.stride[axis]
+        j, k = i + back, i + 2 * back
+        half, place = self._lattice.size[:, :, axis] / 2, sign * self._centroid[:, :, axis]
+        to = (head[:, i] - head[:, j]) / np.maximum(place[:, i] - place[:, j], half[:, j])
+        before = (head[:, j] - head[:, k]) / np.maximum(place[:, j] - place[:, k], half[:, k])
+        before = np.where(self._counts[:, k], van_leer(np.stack([to, before], axis=1)), to)
+        out = np.where(before * to > 0, np.sign(to) * np.minimum(np.abs(before), np.abs(2 * to - before)), 0.0)
+        return np.where(self._counts[:, i] & self._counts[:, j] & self._leads(i, axis, -sign), out, 0.0)
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
         """Return arrays for faces between cells in and outside the fit: index of probe, position, head, weight."""
