@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Bad input is refused before any work, in one line with object, value and allowed values."""
 
+import re
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from helpers import SOFT, beam, column, refused_in_one_line, top_load
@@ -110,6 +113,13 @@ CASES = {
     ),
     "no bodies": (lambda: scene([]), "bodies", "[]"),
     "a body alone": (lambda: scene(BODY), "bodies", "Body"),
+    "conditions within a list": (
+        lambda: scene(conditions=[OPEN, mpm.water("top", 0.5)], fluid=WATER),
+        "conditions",
+        "must be unpacked: [*objects] instead of [objects]",
+    ),
+    "bodies within a list": (lambda: scene([[BODY]]), "bodies", "unpacked"),
+    "no pressure": (lambda: scene(pressure=None, fluid=WATER), "pressure = None", "(0 by default), or a function of x"),
     "no materials": (lambda: scene(materials=[]), "materials", "[]"),
     "materials of a word": (lambda: scene(materials=["sand"]), "materials", "'sand'"),
     "a body of 2D in 3D": (lambda: scene(grid=GRID_3D), "body 0", "2 coordinates"),
@@ -404,3 +414,36 @@ def test_a_load_that_leaves_no_volume_is_refused(fluid, message):
     with pytest.raises(mpm.GaveUp, match=f"{message}, J <= .*: point"):
         s.run(1e6, 1e6)
     assert s.t == 0 and (s.points.J == 1).all()
+
+
+@pytest.mark.parametrize(
+    "make, said",
+    [
+        (
+            lambda: sand(E=2e7),
+            "DruckerPrager: E = 20000000.0 is no constant, must be given as bulk = E / (3 - 6 nu) and",
+        ),
+        (lambda: soil(nu=0.3), "Hencky: nu = 0.3 is no constant, must be given as bulk = "),
+        (lambda: soil(unit_weight=18e3), "unit_weight = 18000.0 is no constant, must be given as grain_density"),
+        (lambda: mpm.Fluid(unit_weight=9810), "Fluid: unit_weight = 9810 is no constant, must be given as density"),
+        (
+            lambda: mpm.VanGenuchten(alpha=3.6, n=1.56),
+            "VanGenuchten: alpha = 3.6 is no constant, must be given as entry",
+        ),
+        (lambda: mpm.Gardner(alpha=3.6), "Gardner: alpha = 3.6 is no constant, must be given as entry"),
+    ],
+)
+def test_a_constant_of_other_programs_is_refused_with_a_formula(make, said):
+    with pytest.raises(TypeError, match=re.escape(said)):
+        make()
+
+
+def test_a_law_may_have_a_constant_of_another_program():
+    law = dataclass(frozen=True)(type("Law", (mpm.Gardner,), {"__annotations__": {"alpha": float}, "alpha": 1.0}))
+    assert law(1e3, alpha=2.0).alpha == 2.0
+
+
+@pytest.mark.parametrize("body", [BODY, mpm.polygon(GRID, [(0, 0), (0.8, 0), (0.1, 0.9)], ["base", "slope", ""])])
+def test_a_body_is_shown_in_a_line(body):
+    assert re.fullmatch(rf"{type(body).__name__}\({len(body)} domains in 2D, .* m, material 0, sides .*\)", repr(body))
+    assert len(repr(body)) < 160 and all(name in repr(body) for name in body.names)

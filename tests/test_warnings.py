@@ -2,6 +2,7 @@
 """Warnings about results, by categories that a user can filter, and log lines."""
 
 import logging
+import re
 import warnings
 from dataclasses import replace
 
@@ -39,12 +40,23 @@ def sea_water():
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 1.0])], [SOFT], walls=WALLS, **water)
 
 
-def rained(flux, retention=None):
+def rained(flux, retention=None, conductivity=1e-5):
     """Return sand below rain, with suction above a water level at a third of its height."""
     grid = mpm.Grid([0, 0], [0.5, 2.0], [2, 8])
-    sand = replace(SOFT, conductivity=1e-5, retention=retention)
+    sand = replace(SOFT, conductivity=conductivity, retention=retention)
     rain = {"conditions": [mpm.Rain("top", flux)], "pressure": mpm.hydrostatic(0.5), "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 1.5])], [sand], walls=WALLS, gravity=(0, -9.81), **rain)
+
+
+def drained(pressure, side="right", gravity=(0, -9.81)):
+    """Return a sand box with a prescribed pore pressure on one side."""
+    grid, water = mpm.Grid([0, 0], [1.0, 2.0], [4, 8]), {"fluid": mpm.Fluid(), "gravity": gravity}
+    held = [mpm.Drained(side, pressure)]
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOFT], walls=WALLS, conditions=held, **water)
+
+
+def in_mm_per_day(t, X):
+    return np.where((X[:, 0] < 0.3) & (t > 15), 26.0, 0.0)
 
 
 def in_radians():
@@ -56,6 +68,21 @@ def in_radians():
 CASES = {
     "of rain in mm/day": (lambda: rained(26.0, mpm.Gardner(1e3)), mpm.ConditionWarning, "rain_top: flux = 26 m/s"),
     "of rain on full pores": (lambda: rained(1e-7), mpm.ConditionWarning, "suction, but no retention curve"),
+    "of rain in mm/day as a function": (
+        lambda: rained(in_mm_per_day, mpm.Gardner(1e3)).run(40.0, 10.0, progress=False),
+        mpm.ConditionWarning,
+        "rain_top: flux = 26 m/s",
+    ),
+    "of rain on soil without conductivity": (
+        lambda: rained(1e-7, mpm.Gardner(1e3), 0.0),
+        mpm.ConditionWarning,
+        "rain_top: the soil at this side has conductivity 0",
+    ),
+    "of a uniform pressure on a high side": (
+        lambda: drained(9810.0),
+        mpm.ConditionWarning,
+        r"drained_right: pressure = 9810 Pa is uniform, but .* differ by 9810 Pa on this side; .* mpm.hydrostatic",
+    ),
     "of an angle": (in_radians, mpm.ConditionWarning, r"friction = 0\.559 degrees, .* not in radians"),
     "of a seeded body": (thin, mpm.ResolutionWarning, "1 point over its thickness"),
     "of conditions": (sea_water, mpm.ConditionWarning, "unit_weight = 9810"),
@@ -69,6 +96,7 @@ def test_a_warning_has_a_category_and_names_the_line_of_the_script(case):
     with pytest.warns(category, match=words) as found:
         make()
     own = [one for one in found if issubclass(one.category, mpm.ResultWarning)]  # compilers of forms may warn too
+    assert len([one for one in own if re.search(words, str(one.message))]) == 1, "one warning"
     assert issubclass(category, mpm.ResultWarning) and {one.filename for one in own} == {__file__}
 
 
@@ -76,6 +104,17 @@ def test_a_storm_on_unsaturated_sand_gives_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error", mpm.ResultWarning)
         rained(3e-4, mpm.Gardner(1e3))
+        rained(lambda t: 3e-4, mpm.Gardner(1e3)).run(1.0, 1.0, progress=False)
+
+
+@pytest.mark.parametrize(
+    "given", [(0.0,), (mpm.hydrostatic(1.0),), (9810.0, "top"), (9810.0, "right", None), (9810.0, "right", (0, 0))]
+)
+def test_a_plausible_pressure_on_a_side_gives_no_warning(given):
+    """A drain, water at rest, a level side, and a side without gravity."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", mpm.ResultWarning)
+        drained(*given)
 
 
 def test_a_warning_that_is_an_error_leaves_the_scene_as_it_was():

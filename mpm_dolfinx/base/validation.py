@@ -32,7 +32,7 @@ from inspect import signature
 from math import inf
 from pathlib import Path
 from types import FunctionType, MethodType
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -89,6 +89,20 @@ def numbers(
     return out
 
 
+class Constants:
+    """Base class of objects with constants.  Names of other programs raise TypeError with a formula."""
+
+    FOREIGN: ClassVar[Mapping[str, str]] = {}
+    """Names of other programs, and how to compute the constants of this class from them."""
+
+    def __new__(cls, *args, **given):
+        for name in given:
+            if name in cls.FOREIGN and name not in cls.__dataclass_fields__:
+                what = f"{cls.__name__}: {name} = {line(given[name])} is no constant"
+                raise TypeError(f"{what}, must be given as {cls.FOREIGN[name]}")
+        return super().__new__(cls)
+
+
 def whole(name: str, value, least: int = 1) -> int:
     """Return the value as an integer.  Raise ValueError if it is not an integer >= `least`."""
     allowed = f"an integer >= {least}"
@@ -126,6 +140,8 @@ def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> 
         raise ValueError(f"{name} = {what}, must be {allowed}")
     for value in values:
         if not isinstance(value, kind):
+            if isinstance(value, (list, tuple)) and any(isinstance(one, kind) for one in value):
+                allowed = "unpacked: [*objects] instead of [objects]"
             raise ValueError(f"{name}: {line(value)}, must be {allowed}")
 
 

@@ -31,6 +31,12 @@ class Body:
     def __len__(self) -> int:
         raise NotImplementedError
 
+    def __repr__(self) -> str:
+        """Return one line with the number of domains, the bounding box before mapping, the material and the sides."""
+        low, high = (f"[{' '.join(f'{x:.6g}' for x in corner)}]" for corner in self.bounds)
+        what = f"{type(self).__name__}({len(self)} domains in {self.dim}D, {low} to {high} m"
+        return f"{what}, material {self.material}, sides {', '.join(self.names) or 'without names'})"
+
     @property
     def dim(self) -> int:
         """Number d of dimensions."""
@@ -249,13 +255,16 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
     return body
 
 
+PRESSURES = "a finite number (0 by default), or a function of x"
+
+
 def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the pore pressures (n,), in Pa, at positions x (n, d), from a number or a function of position."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
         given = at_places("pressure", allowed, pressure, "x", x)
         return np.broadcast_to(numbers("pressure(x)", given, (), (len(x),), allowed=allowed), len(x)).copy()
-    return np.full(len(x), 0.0 if callable(pressure) else float(numbers("pressure", pressure)))
+    return np.full(len(x), 0.0 if callable(pressure) else float(numbers("pressure", pressure, allowed=PRESSURES)))
 
 
 def material_points(

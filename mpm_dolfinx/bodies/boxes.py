@@ -16,7 +16,7 @@ from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.grid.grid import MOST, Grid, among, begin_with, corner_bits, in_chunks
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class LatticeBody(Body):
     """A body of boxes on a lattice.  Rows, which are layers of boxes normal to an axis, may differ in width."""
 

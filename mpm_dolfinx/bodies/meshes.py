@@ -54,7 +54,7 @@ class Mesh:
         return chosen
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class MeshBody(Body):
     """A body seeded from a mesh.  Its `boxes` are the bounding boxes of the domains."""
 

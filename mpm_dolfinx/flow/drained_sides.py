@@ -29,8 +29,9 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Setting
 from mpm_dolfinx.conditions.conditions import Drained, Inflow, Rain
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
+from mpm_dolfinx.flow.feeding import Beginning, Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
+from mpm_dolfinx.flow.plausible_sides import Plausible
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import sum_by
@@ -60,11 +61,21 @@ class DrainedSides(Feeding):
         for (one, faces), (other, others) in combinations(self._outlets, 2):
             faces.check_apart(others, (one, other))
         self._constant: Latest[OpenSides] = Latest()
+        self._plausible = Plausible(setting.materials)
 
     @property
     def surfaces(self) -> list[Surface]:
         """Faces on which the conditions act."""
         return [faces for _, faces in self._outlets]
+
+    def check(self, begins: Beginning) -> None:
+        """Warn of implausible rain and pressures at their beginning."""
+        for name, (one, faces), rains in zip(self._names, self._outlets, self._rains, strict=True):
+            if name in begins.names and rains:
+                self._plausible.rain(name, faces.id, begins)
+                self._plausible.flux(name, 0.0 if callable(one.flux) else one.flux)
+            elif name in begins.names:
+                self._plausible.pressure(name, getattr(one, "pressure", None), faces.places(), begins)
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return placeholders for the results before the first step: `value` for rates, and zero for volumes."""
@@ -90,6 +101,8 @@ class DrainedSides(Feeding):
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
             given = together(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points)))
+            if self._rains[i] and callable(outlet.flux) and self._names[i] not in self._plausible.heavy:
+                self._plausible.flux(self._names[i], given.flux if len(p.x) else 0.0)
             values = np.empty((5, len(p.x)))
             for row, value in zip(values, (i, *given), strict=True):
                 row[:] = value

@@ -8,7 +8,7 @@ for the momentum balance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -38,6 +38,14 @@ class Wet(NamedTuple):
     outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
     loads: Sequence[Any] = ()  # loads in the balance of momentum; empty if only open sides are needed
     at: Any = None  # present displacements, see `acting.At`
+
+
+class Beginning(NamedTuple):
+    """Data for the checks of conditions at the start of a stage."""
+
+    points: MaterialPoints  # material points at their current positions
+    names: Collection[str]  # names of the conditions that begin
+    gravity: NDArray[np.float64] | None  # acceleration of gravity (d,), m/s^2; None without gravity
 
 
 class Fluid(NamedTuple):
@@ -133,6 +141,9 @@ class Feeding:
     """Whether prescribed pressures or fluxes depend on time or position."""
     surfaces: Sequence[Surface] = ()
     """Faces on which the conditions act."""
+
+    def check(self, begins: Beginning) -> None:
+        """Warn of implausible conditions at the start of a stage.  All processes call this method."""
 
     def placed(self, wet: Wet) -> Feeds:
         """Return the flow rates of the conditions in a substep."""

@@ -17,7 +17,7 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.validation import at_places, functions, instance, line, numbers
+from mpm_dolfinx.base.validation import Constants, at_places, functions, instance, line, numbers
 from mpm_dolfinx.forms.axes import planar
 from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.pores.retention import check_retention
@@ -27,6 +27,9 @@ Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 
 X contains the points of one process only.  The value at a point must not depend on other points: do not use means.
 """
+
+BY_MODULI = "bulk = E / (3 - 6 nu) and shear = E / (2 + 2 nu)"
+BY_GRAINS = "grain_density, kg/m^3, and porosity: dry soil weighs 9.81 (1 - porosity) grain_density, N/m^3"
 
 BY_SCENE = ("dt", "cell_size")
 """Arguments that laws receive from the scene: the time since the start of the step, s, and the cell size, m."""
@@ -52,7 +55,7 @@ it by 1.5e-02.
 
 
 @dataclass(frozen=True)
-class Skeleton:
+class Skeleton(Constants):
     """Porous skeleton, the base class of all laws.  Parameters may vary with position, see `Field`.
 
     Parameters
@@ -150,6 +153,7 @@ class Skeleton:
     conductivity_law: Callable | None = None
     retention: Any = field(default=None, kw_only=True)
 
+    FOREIGN: ClassVar = {"E": BY_MODULI, "nu": BY_MODULI, "unit_weight": BY_GRAINS, "density": BY_GRAINS}
     energy: ClassVar[Callable | None] = None
     kirchhoff: ClassVar[Callable | None] = None
     update: ClassVar[Callable | None] = None
@@ -168,13 +172,6 @@ class Skeleton:
     """The names `dt` and `cell_size`, if they are arguments of the law's functions."""
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of fields and properties that are arguments of the law's functions."""
-
-    def __new__(cls, *args, **given):
-        """Create the material.  Raise TypeError with formulas for Young's modulus and Poisson's ratio."""
-        if wrong := [name for name in ("E", "nu") if name in given and name not in cls.__dataclass_fields__]:
-            what = f"{cls.__name__}: {wrong[0]} = {line(given[wrong[0]])} is no constant"
-            raise TypeError(f"{what}, must be given as bulk = E / (3 - 6 nu) and shear = E / (2 + 2 nu)")
-        return super().__new__(cls)
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -489,7 +486,7 @@ class unsaturated:
 
 
 @dataclass(frozen=True)
-class Fluid:
+class Fluid(Constants):
     """Pore fluid.
 
     Parameters
@@ -513,6 +510,7 @@ class Fluid:
     bulk: float = 2.2e9
     density: float = 1000.0
     gravity: float | None = None
+    FOREIGN: ClassVar = {"unit_weight": "density = unit_weight / 9.81"}
 
     def __post_init__(self):
         finite = {"test": lambda v: (0 < v) & (v < inf), "allowed": "> 0 and finite"}

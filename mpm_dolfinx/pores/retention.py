@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import ufl
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
 from mpm_dolfinx.base.tolerances import TINY
-from mpm_dolfinx.base.validation import asked, line, numbers
+from mpm_dolfinx.base.validation import Constants, asked, line, numbers
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid
 
@@ -36,7 +37,7 @@ METHODS = ("saturation", "relative_permeability")
 
 
 @dataclass(frozen=True)
-class Retention:
+class Retention(Constants):
     """Base of retention curves defined by an effective saturation S_e: S = S_r + (1 - S_r) S_e.
 
     A derived law is a frozen dataclass of numbers.  The method `effective(s)` returns S_e, and the method `conducts(s)`
@@ -57,6 +58,7 @@ class Retention:
 
     entry: float
     residual: float = 0.0
+    FOREIGN: ClassVar = {"alpha": "entry, Pa: 9810 / alpha for alpha in 1/m, or 1000 / alpha for alpha in 1/kPa"}
 
     def __post_init__(self):
         _number(self, "entry", lambda v: v > 0, "> 0 and finite")

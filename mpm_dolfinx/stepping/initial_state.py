@@ -28,12 +28,13 @@ from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Place
-from mpm_dolfinx.conditions.conditions import Quiet, Rain, Tied
+from mpm_dolfinx.conditions.conditions import Quiet, Tied
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
 from mpm_dolfinx.dynamics.at_rest import balancing_tractions
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides, traction_name
+from mpm_dolfinx.flow.feeding import Beginning
 from mpm_dolfinx.grid.grid import SIDES, sum_by
 from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
@@ -62,10 +63,6 @@ This value is also the largest allowed relative residual of the forces.
 """
 
 
-HEAVIEST = 31.2e-3 / 60
-"""Largest measured rain, in m/s.  Source: World Meteorological Organization: 31.2 mm in a minute, Unionville 1956."""
-
-
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
     """Return the state of a scene in its first stage, before its initial stresses are balanced."""
     present = [body not in later for body in range(len(scene.bodies))]
@@ -84,7 +81,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         warn_units(comm, scene.fluid, gravity)
     points = scene.seeded(present)
     points = _prestressed(scene, points, present, first.gravity_at(0.0) if scene.initial.given else None)
-    _warn_rain(scene, points, first.of(Rain))
+    for one in first.feeding:
+        one.check(Beginning(points, first.named, first.gravity_at(0.0)))
     pieces = None
     if all(present):
         scene.materials.seeds_no_more()
@@ -99,20 +97,6 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         outcome=first.unknown(np.nan if scene.initial.given else 0.0),
         stage=first,
     )
-
-
-def _warn_rain(scene: Scene, points: MaterialPoints, rains: Mapping[str, Rain]) -> None:
-    """Warn of implausible values of rain, and of rain that soil with suction cannot take up."""
-    materials, comm = scene.materials, scene.grid.comm
-    most = max(np.inf if callable(m.conductivity) else np.max(m.conductivity) for m in materials.materials)
-    for name, rain in rains.items():
-        if not callable(rain.flux) and rain.flux > max(HEAVIEST, 1000 * most):
-            what = "%s: flux = %.3g m/s, above any rain, and above 1000 times the conductivity; 1 mm/day is 1.16e-8 m/s"
-            warn(comm, ConditionWarning, what, name, rain.flux)
-        full = materials.retentions is None and not materials.drains
-        if full and over_all(comm, float(points.pressure.min(initial=0.0)), MPI.MIN) < 0:
-            what = "%s: the soil has suction, but no retention curve, so its full pores store no rain; give a retention"
-            warn(comm, ConditionWarning, what, name)
 
 
 def begin_stage(
@@ -141,7 +125,8 @@ def begin_stage(
     after = scene.stage({**before.conditions, **named, "conditions": conditions}, present, later)
     _check_weight(after, before, state.t)
     _warn_dammed(scene, after, state.t)
-    _warn_rain(scene, state.points, {name: rain for name, rain in after.of(Rain).items() if name not in before.named})
+    for one in after.feeding:
+        one.check(Beginning(state.points, after.named.keys() - before.named.keys(), after.gravity_at(state.t)))
     if "gravity" in named or waters(after.given) != waters(before.given):
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
