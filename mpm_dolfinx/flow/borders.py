@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mean_density
-from mpm_dolfinx.base.tolerances import EPSILON
+from mpm_dolfinx.base.tolerances import EPSILON, TINY
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility
 from mpm_dolfinx.flow.layers import MixedCells
 from mpm_dolfinx.flow.series import Paths, none, through
@@ -60,8 +60,9 @@ class Borders:
         """`facets`: facets of this process between cells of different soil.  `uniform`: all other facets."""
         offset = grid.midpoints[grid.facet_cells[self.facets]]
         offset = offset[:, 1] - offset[:, 0]
-        self._axis = np.abs(offset).argmax(axis=1)
-        downward = np.take_along_axis(offset, self._axis[:, None], axis=1) < 0
+        self.axis = np.abs(offset).argmax(axis=1)
+        """Axis normal to each of `facets`."""
+        downward = np.take_along_axis(offset, self.axis[:, None], axis=1) < 0
         self._pair = np.where(downward, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
         of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # other processes need them
         self._cells = np.unique(np.append(self._pair, of_others))
@@ -95,7 +96,7 @@ class Borders:
             for of, given in zip(out, paths.with_slots(slots), strict=True):
                 of[own[mixed]] = given[self.mixed[cells[mixed]]]
         out = self._from_others(out)
-        (first, other), axis = self._pair, self._axis
+        (first, other), axis = self._pair, self.axis
         h = grid.sizes(np.concatenate([first, other]))
         h = np.broadcast_to(h, (2 * len(axis), d)).reshape(2, len(axis), d)
         rows, unit = np.arange(len(axis)), np.eye(d)[axis]
@@ -166,13 +167,23 @@ class BorderFaces:
     weight: NDArray[np.float64]  # unit weight of the fluid (d,), N/m^3
     bulk: float  # bulk modulus of the fluid, Pa
 
-    def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
+    def flows(
+        self,
+        p: NDArray[np.float64],
+        force: NDArray[np.float64] | None,
+        slopes: NDArray[np.float64],
+        shares: NDArray[np.float64],
+    ) -> BorderFlows:
         """Return the fluxes through the faces.
 
         `p` (2, m), Pa: pressures on both sides of each face.
         `force` (c, d), N/m^3: inertia force on the fluid in the local cells.
+        `slopes` (2, m, d), Pa/m: gradients on both sides, whose components along the faces correct the fluxes.
+        `shares` (2, m): weights of these gradients.
         """
-        weight = (
+        lateral = (shares[:, :, None] * slopes).sum(axis=0) / (shares.sum(axis=0)[:, None] + TINY)
+        np.put_along_axis(lateral, self.borders.axis[:, None], 0.0, axis=1)
+        weight = lateral + (
             self.weight
             if force is None
             else self.weight + with_ghosts(self.borders.grid.cellwise(), force)[self.pair].mean(0)

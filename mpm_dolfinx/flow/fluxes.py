@@ -418,8 +418,8 @@ class FluxForms:
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
         self.active = active
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
-        vectors = (fem.Function(grid.cellwise((d,))) for _ in range(5))
-        self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face = vectors
+        vectors = (fem.Function(grid.cellwise((d,))) for _ in range(6))
+        self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face, self.slope = vectors
         n0 = ufl.FacetNormal(mesh)("+")
         h0, h1, across = across_faces(grid, n0)
 
@@ -446,7 +446,13 @@ class FluxForms:
             weight = along if weight is None else weight + along
             by_motion = ufl.derivative(along, moved, ufl.TrialFunction(moved.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
+        off = ufl.jump(self.centroid)
+        slope = ufl.avg(self.slope)
+        if relative is not None:  # nearly empty cells, whose pressures vary most, have small weights
+            slope = ufl.avg(self.fixed_stress * self.slope) / (ufl.avg(self.fixed_stress) + TINY)
+        lateral = ufl.dot(slope, off - ufl.dot(off, n0) * n0)
         if relative is not None:
+            drop = drop - lateral
             between = relative.between(pressure, drop)
             k0, k1 = (k * relative.conducts(side, [one.k for one in between]) for k, side in ((k0, "+"), (k1, "-")))
         resistance = d0 * k1 + d1 * k0 + TINY
@@ -460,15 +466,11 @@ class FluxForms:
         h = grid.edge_in_forms()("+")
         volume = prod(h[a] for a in range(d))  # divided by h0, this is the area of the face on both sides
         self.alternation = FacetForm(smaller / (4 * d) * h0 / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
-        self.slope = fem.Function(grid.cellwise((d,)))
         self.density = fem.Function(Q)
         self._sum = fem.Function(Q)
-        off = ufl.jump(self.centroid)
-        along = off - ufl.dot(off, n0) * n0
         self.nonorthogonal = None
         if flows and not grid.axisymmetric:
-            flow = T * ufl.avg(self.density) * ufl.dot(ufl.avg(self.slope), along)
-            self.nonorthogonal = FacetForm(-flow * ufl.jump(q) * dS, grid.comm)
+            self.nonorthogonal = FacetForm(-T * ufl.avg(self.density) * lateral * ufl.jump(q) * dS, grid.comm)
         self.gravity = self.by_motion = None
         if (weight is not None or relative is not None) and flows:
             # still water must not flow: its pressure increases with depth by the unit weight at zero pressure.
@@ -496,6 +498,11 @@ class FluxForms:
                 slope = ufl.max_value(own, 0.0) * dp("+") + ufl.min_value(other, 0.0) * dp("-")
                 self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
 
+    @property
+    def gradients(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gradients (c, d) for the non-orthogonal correction, in Pa/m, and their weights (c,), in local cells."""
+        return self.slope.x.array.reshape(-1, self.grid.dim), self.fixed_stress.x.array
+
     def unequal(self, filled: NDArray[np.int32], mean: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the mobilities of local cells from `mean` of the filled cells, or None if all are equal."""
         comm = self.grid.comm
@@ -516,6 +523,8 @@ class FluxForms:
     ) -> NDArray[np.float64]:
         """Return the outflow of local cells through `facets`, in m^d/s, due to the gradients `slope` in `cells`.
 
+        In unsaturated soil the result is zero, and the forms of the fluxes contain the gradients from now on.
+
         `slope` (n, d), Pa/m: see `Gradients`.
         `active` (c,): active local cells.
         `density` (c,): density of the fluid in these cells, divided by the density at zero pressure.
@@ -526,7 +535,8 @@ class FluxForms:
         of_cells[active] = 0.0
         of_cells[cells] = slope
         self.slope.x.scatter_forward()
-        facets.assemble_vector(self._sum.x.array)
+        if self.relative is None:
+            facets.assemble_vector(self._sum.x.array)
         return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:

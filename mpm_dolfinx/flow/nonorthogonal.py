@@ -8,12 +8,17 @@ the unit weight of the fluid.  The corrected flux is (see `storage` for other sy
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
+In unsaturated soil, the term with G is a part of the pressure drop along the face (`unsaturated.fitted`).  The
+relative conductivity thus limits this term while a cell drains.  The weights of G+ and G- are the volumes of the
+material in both cells, times the fixed-stress coefficients.
+
 At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  The centroid is projected onto the side.  Here t
 points from this projection to the centre of the face on the side.
 
 The gradients are a least-squares fit to the pressures of neighbouring cells and drained sides, and to zero flow through
-other sides.  A neighbour that conducts less than the cell has a smaller weight in the fit.  The fit is exact for linear
-pressures.  Gradients are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
+other sides.  A neighbour that conducts less than the cell has a smaller weight in the fit.  In unsaturated soil, nearly
+empty cells have small weights too, because their pressures vary most.  The fit is exact for linear pressures.
+Gradients are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -61,9 +66,16 @@ class Gradients:
     `contents`: material in the cells.
     `sides`: open sides of the bodies.
     `mobility` (c,), m^2/(Pa s): mobility of the local cells, or None if it is equal in all cells or varies in time.
+    `fill` (c,): filled fractions of the local cells in unsaturated soil, else None.
     """
 
-    def __init__(self, contents: CellContents, sides: OpenSides, mobility: NDArray[np.float64] | None = None):
+    def __init__(
+        self,
+        contents: CellContents,
+        sides: OpenSides,
+        mobility: NDArray[np.float64] | None = None,
+        fill: NDArray[np.float64] | None = None,
+    ):
         self._grid = grid = contents.grid
         d = contents.grid.dim
         centroid = contents.centroid
@@ -83,6 +95,8 @@ class Gradients:
                 1.0, np.divide(2 * other, own + other, out=np.zeros(inside.shape), where=own + other > 0)
             )
         self._open = np.where(inside, weight, 1.0) * share[contents.filled]
+        if fill is not None:
+            weight = weight * np.minimum(1.0, fill[cells] / fill[contents.filled][:, None, None])
         cells, inside = cells.reshape(-1, 2 * d), inside.reshape(-1, 2 * d)
         separation = centroid[cells] - centroid[contents.filled][:, None]
         along = np.where(inside[:, :, None], separation / 2, 0.0)

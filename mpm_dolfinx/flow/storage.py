@@ -181,7 +181,7 @@ class StorageForms:
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
-            borders = relative.set_pressures(self.p.x.array, force)
+            borders = relative.set_pressures(self.p.x.array, force, self.fluxes.gradients)
         self._sums[active] = 0.0
         assembled.assemble_vector(self._sums)
         if borders is not None:
@@ -342,7 +342,7 @@ class StorageSystem:
         self.T.zeroEntries()
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
-            borders = relative.set_pressures(self._forms.p.x.array, force)
+            borders = relative.set_pressures(self._forms.p.x.array, force, self._forms.fluxes.gradients)
         if (flux := (self._uniform or self._over_uniform())[0]) is not None:
             flux.assemble_matrix(self.T)
         if borders is not None:
@@ -410,6 +410,7 @@ class StorageProblem:
         self._flow = flow
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
+        forms.fluxes.slope.x.array[:] = 0.0
         outflow = flow(before is None)
         least, static = dt * outflow.mobility.min(axis=1), 1.0
         if inertial is not None:

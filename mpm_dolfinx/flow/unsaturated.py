@@ -149,19 +149,23 @@ class Relative:
         """
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
-    def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
+    def set_pressures(
+        self, p: NDArray[np.float64], force: NDArray[np.float64] | None, gradients: tuple[NDArray[np.float64], ...]
+    ) -> Any:
         """Set the coefficients of forms for the pressures of the local cells.
 
         Return the fluxes through faces between cells of different soil (see `borders`), or None without such faces.
 
         `p` (c,), Pa: pressures of the local cells.
         `force` (c, d), N/m^3: inertia force on the fluid.
+        `gradients`: see `FluxForms.gradients`.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self.laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
             return None
-        pair = p[faces.pair]
-        return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
+        pair, *slopes = (values[faces.pair] for values in (p, *gradients))
+        key = (faces, pair, force, *slopes)
+        return self._flows(key, lambda: faces.flows(pair, force, *slopes), self._grid.comm)
 
     def uniform(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the `facets` between active cells that have the same soil on both sides."""

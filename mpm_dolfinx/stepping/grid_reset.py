@@ -610,7 +610,8 @@ class Assembled(Keyed):
 
         def fit() -> Gradients | None:
             needed = self._off.some or off_middle(sides, grid).any()
-            return Gradients(contents, sides, kappa) if needed else None
+            fill = self._fluxes.unequal(contents.filled, contents.fill) if of_step[0] else None
+            return Gradients(contents, sides, kappa, fill) if needed else None
 
         def conductivities() -> NDArray[np.float64] | None:
             return self._fluxes.unequal(contents.filled, mobility(True).mean)
