@@ -41,6 +41,7 @@ from mpm_dolfinx.conditions.conditions import (
     Tied,
     Traction,
 )
+from mpm_dolfinx.conditions.jumps import Stepwise
 from mpm_dolfinx.conditions.record import Record
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
@@ -150,6 +151,7 @@ __all__ = [
     "SofteningDruckerPrager",
     "Source",
     "State",
+    "Stepwise",
     "SurfaceMesh",
     "Tangent",
     "Through",

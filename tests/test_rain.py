@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 import rain
 import ufl
+from richards import infiltration
 from test_unsaturated import STIFF, WATER, column, water
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.conditions.jumps import before_jumps
 
 K = 1e-5  # m/s
 
@@ -292,3 +294,85 @@ def test_a_long_slope_slides_when_its_strength_is_divided_by_its_factor(depth, s
     weight = depth * 9.81 * (0.65 * 2650 + 350 * full(y)).mean()
     held = rain.COHESION + (weight * steep**2 - full(0.0) * pressure(0.0)) * np.tan(rain.FRICTION)
     assert factor == pytest.approx(held / (weight * np.sin(rain.SLOPE) * steep), rel=0.01)
+
+
+@pytest.mark.parametrize("steps", [{"rtol": 1e-2}, {"dt": 1100.0}, {"dt": 1800.0}, {"dt": 7200.0}])
+@pytest.mark.parametrize(
+    "flux",
+    [
+        mpm.Stepwise([0, 3600], [0.3 * K, 0]),
+        mpm.Stepwise([0, 2000, 2030], [0, 36 * K, 0]),
+        lambda t: 0.3 * K if t < 3600 else 0.0,
+        lambda t: 0.3 * K if t <= 3600 else 0.0,
+    ],
+)
+def test_rain_that_jumps_within_a_step_falls_completely(flux, steps):
+    s = rained(flux)
+    result = s.run(7200, **steps, progress=False)
+    assert s.outcome("rained")["rain"] == pytest.approx(0.3 * K * 3600 / 10, rel=1e-12)
+    assert result.cuts == 0
+
+
+def test_a_jump_ends_the_step_and_no_smooth_function_does():
+    jumps = [(0.3, np.sign), (0.5, lambda d: d >= 0), (0.7, lambda d: np.sin(d) + (d > 0))]
+    for at, of in jumps:
+        end = before_jumps([lambda t, at=at, of=of: of(t - at)], 0.0, 1.0)
+        assert at - 1e-13 < end < at
+        assert before_jumps([lambda t, at=at, of=of: of(t - at)], end, 1.0) == 1.0
+    for of in (np.sin, lambda t: min(t, 0.3), lambda t: np.exp(-1e4 * (t - 0.4) ** 2), lambda t: 5.0):
+        assert before_jumps([of], 0.0, 1.0) == 1.0
+    table = mpm.Stepwise([0.0, 0.2, 0.6], [1.0, 2.0, 3.0])
+    ends = [0.0]
+    while ends[-1] < 1:
+        ends.append(before_jumps([table], ends[-1], 1.0))
+    assert ends == pytest.approx([0, 0.2, 0.6, 1], rel=1e-13)
+    assert [float(table(end)) for end in ends] == [1, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("times", "values", "said"),
+    [
+        ([0, 0], [1, 2], r"Stepwise: times = \[0, 0\], must be increasing times"),
+        ([0, 1], [1], r"Stepwise: values of shape \(1,\), must be one value, or .*, for each of 2 times"),
+        ([0, 1], [1, np.nan], "Stepwise: values = .*nan.*must be finite numbers"),
+    ],
+)
+def test_tables_with_errors_are_refused(times, values, said):
+    with pytest.raises(ValueError, match=said):
+        mpm.Stepwise(times, values)
+
+
+def test_a_time_before_the_table_is_refused():
+    with pytest.raises(ValueError, match=r"t = .*must not be before the first time, 10000 s"):
+        rained(mpm.Stepwise([1e4], [K])).run(3600, 600, progress=False)
+
+
+def test_steps_end_at_jumps_of_tractions():
+    grid = mpm.Grid([0, 0], [0.5, 1.5], [1, 3])
+    load = mpm.Traction("top", mpm.Stepwise([0, 5], [0, -1e3]))
+    soil = mpm.LinearElastic(bulk=1e6, shear=6e5)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 1])], [soil], walls=walls, conditions=[load])
+    s.run(5, 5, progress=False)
+    assert s.points.displacement[:, 1].min() == 0  # the value before the jump
+    s.run(10, 5, progress=False)
+    assert s.points.displacement[:, 1].min() == pytest.approx(-0.875 * 1e3 / 1.8e6, rel=1e-3)
+
+
+def test_infiltration_and_evaporation_are_those_of_richards_equation():
+    """Rain beyond the conductivity of loam, then evaporation until the soil limits it."""
+    law = mpm.VanGenuchten(2725.0, residual=0.18, n=1.56, air_entry=200.0)
+    soil = mpm.LinearElastic(**STIFF, porosity=0.43, conductivity=2.9e-6, retention=law)
+    ends, rates = [6 * 3600.0, 5 * 86400.0, 20 * 86400.0], [5e-6, -1e-7, -1e-7]
+    rain = mpm.Rain("top", mpm.Stepwise([0, *ends[:-1]], rates), name="rain")
+    s = column(20, [soil], mpm.hydrostatic(-1.0), [rain], initial_stress=mpm.K0(0.5))
+    entered = []
+    for end in ends:
+        s.run(end, rtol=1e-2, t_eval=[end], progress=False)
+        entered.append(-20 * s.outcome("flowed")["rain"])
+    constants = {"alpha": WATER / law.entry, "n": law.n, "air_entry": law.air_entry / WATER, "residual": law.residual}
+    constants |= {"porosity": 0.43, "conductivity": 2.9e-6}
+    exact = infiltration(constants, 1.0, -1.0, list(zip(ends, rates, strict=True)), -1e7 / WATER)
+    assert entered[0] == pytest.approx(exact[0], rel=2e-3)
+    assert entered[0] - np.array(entered[1:]) == pytest.approx(exact[0] - exact[1:], rel=1.5e-2)
+    assert exact[0] - exact[2] < 0.3 * 1e-7 * 20 * 86400  # the soil limits evaporation

@@ -321,6 +321,9 @@ class Rain(Flux):
     strain): "flowed" (outflow), "rained" (rain less potential evaporation), "ran_off" (run-off and seepage), and
     "ponded" (the pond).  "rained" plus "flowed" equals "ran_off" plus "ponded".
 
+    Steps end at the jumps of `Stepwise` rain.  They also end at the jumps of rain that is a function of time alone, if
+    the rain lasts for at least 1/64 of a step.
+
     Parameters
     ----------
     side

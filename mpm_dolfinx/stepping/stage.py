@@ -30,6 +30,7 @@ from mpm_dolfinx.conditions.conditions import (
     Tied,
     Traction,
 )
+from mpm_dolfinx.conditions.jumps import before_jumps, functions_of_time
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.conditions.walls import fixed_corners, fixed_nodes, with_axis
@@ -135,6 +136,15 @@ class Stage:
     def surfaces(self) -> list[Surface]:
         """Faces of all conditions except tools and contacts."""
         return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
+
+    @cached_property
+    def _functions_of_time(self) -> list:
+        return functions_of_time(self.given.values(), self.conditions["gravity"])
+
+    def without_jump(self, t: float, dt: float) -> float:
+        """Return the length of a step from t (s): `dt` (s), or less if a function of time jumps in the step."""
+        end = before_jumps(self._functions_of_time, t, t + dt)
+        return dt if end == t + dt else end - t
 
     @property
     def faces(self) -> list[Surface]:
