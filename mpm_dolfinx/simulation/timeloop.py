@@ -221,8 +221,8 @@ def _histories(
     latest = simulation.state.result
     control = simulation.state.control
     if after is None:
-        before = (0.0,) if control is None else control.first
-        fresh = StepControl(times.interval, rule.first, first=before)
+        before = {} if control is None else {"first": control.first, "filled": control.filled}
+        fresh = StepControl(times.interval, rule.first, **before)
         if rule.by_error and state.stage.inertia:
             held = state.stage.supported(state.points.corners)
             fresh = replace(fresh, motion=0.0, drift=drift(simulation.scene.materials, state.points, held))

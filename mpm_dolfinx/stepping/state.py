@@ -56,7 +56,7 @@ class StepControl:
     drift : m/s
         Mean velocity of free bodies at the start of the run, see `motion_error`.
     filled
-        Largest change of the water content in any step since the start of the run.
+        Largest change of the water content in any step so far, also in earlier runs.
     """
 
     interval: float = 0.0
