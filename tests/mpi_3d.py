@@ -27,7 +27,7 @@ simulation = mpm.Simulation(
     ],
     numerics=mpm.Numerics(tolerance=1e-11),
 )
-result = simulation.run(1.0, 0.25, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 simulation.cells()
 if state := gathered(simulation, p=points.pressure):

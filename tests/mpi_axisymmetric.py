@@ -16,7 +16,7 @@ push = mpm.Displacement("top", lambda t, X: (0, -0.1 * t), region=((0, 0), (0.45
 drained = [mpm.Drained("right"), mpm.Drained("top", region=((0.45, 0), (2, 2)))]
 acting = {"conditions": [push, *drained, mpm.Pressure("right", 2e4)]}
 simulation = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls={"bottom": "xy"}, **acting)
-result = simulation.run(1.0, 0.2, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 stress, hardened = simulation.effective_stress(), points.data["hardened"]
 acts = {"reactions": simulation.reactions.array.ravel(), "outflows": simulation.outflows.array}

@@ -7,7 +7,7 @@ import numpy as np
 from helpers import beam
 
 simulation, probe = beam(load=54e3)
-result = simulation.run(0.1, 0.02, probes=probe, progress=False)
+result = simulation.run(0.1, 0.05, probes=probe, progress=False)
 cells, number = simulation.cells(), simulation.grid.cell_number
 held = simulation.grid.comm.gather((number[cells.cell], cells.pressure, cells.stress, cells.volume))
 parts = simulation.grid.comm.gather((simulation.points.id, simulation.points.x, simulation.points.pressure))

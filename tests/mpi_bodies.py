@@ -18,6 +18,7 @@ from mpm_dolfinx.parallel import machine_files
 
 grid = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
 comm, folder = grid.comm, Path(sys.argv[1])
+folder.mkdir(exist_ok=True)
 tempfile.tempdir = str(folder)
 
 

@@ -50,7 +50,7 @@ def pressed_in_3d():
 
 if __name__ == "__main__":
     simulation, solid = pressed(), pressed_in_3d()
-    result, other = (s.run(1.0, 0.25, progress=False) for s in (simulation, solid))
+    result, other = (s.run(1.0, 0.5, progress=False) for s in (simulation, solid))
     state, in_3d = gathered(simulation), gathered(solid)
     if state:
         in_3d = {f"{name} in 3D": rows for name, rows in in_3d.items() if name != "counts"}

@@ -24,6 +24,6 @@ def pushed(load=None):
 
 if __name__ == "__main__":
     simulation = pushed()
-    result = simulation.run(0.1, 0.025, progress=False)
+    result = simulation.run(0.1, 0.05, progress=False)
     if state := gathered(simulation):
         np.savez(sys.argv[1], **state, balance=result.balance, lines=np.concatenate(simulation.grid.lines))

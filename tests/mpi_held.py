@@ -15,7 +15,7 @@ from meshes import box_mesh
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io.checkpoint import save
 
-file = Path(sys.argv[1])
+file = sys.argv[1]
 points, seen = float(sys.argv[2]), []
 
 
@@ -52,8 +52,8 @@ s.run(0.1, 0.1, progress=False)
 bytes_of, lengths = scaling.held(s, buffers=False)
 files = bytes_of.pop("files")
 row = [len(s.points), max(seen, default=0), sum(bytes_of.values()), len(lengths & WHOLE), files]
-row.append(peak(lambda: save(s, file.with_suffix(".checkpoint"))))
-row.append(peak(lambda: mpm.resume(s, file.with_name("1.checkpoint"))))
+row.append(peak(lambda: save(s, Path(f"{file}-{grid.comm.size}.checkpoint"))))
+row.append(peak(lambda: mpm.resume(s, f"{file}-1.checkpoint")))
 names = ("points", "asked", "held", "whole", "files", "written", "read")
 if rows := grid.comm.gather(row):
-    np.savez(file, **dict(zip(names, np.array(rows).T, strict=True)))
+    np.savez(f"{file}-{grid.comm.size}.npz", **dict(zip(names, np.array(rows).T, strict=True)))

@@ -23,6 +23,6 @@ simulation = mpm.Simulation(
     walls={"left": "x", "right": "x", "bottom": "y"},
     conditions=[mpm.Traction("top", lambda t: -1e5 * t), mpm.Drained("right")],
 )
-result = simulation.run(1.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.3, 0.8]]), progress=False)
+result = simulation.run(1.0, 0.5, probes=mpm.probes(bodies, [[0.3, 0.4], [0.3, 0.8]]), progress=False)
 if state := gathered(simulation, p=simulation.points.pressure, stress=simulation.effective_stress()):
     np.savez(sys.argv[1], **state, probes=result.displacement[-1], balance=result.balance)

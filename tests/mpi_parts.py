@@ -15,4 +15,5 @@ if parts:
     order, n = np.argsort(ids), len(simulation.bodies[0])
     rows = {"u": u[order], "p": p[order], "s": s[order]}
     both = {f"{name} {i}": part for name, v in rows.items() for i, part in enumerate((v[:n], v[n:]))}
-    np.savez(sys.argv[1], **both, first=np.array([h[0] for h in history]))
+    counts, first = [len(part[0]) for part in parts], [h[0] for h in history]
+    np.savez(sys.argv[1], **both, first=first, x=rows["u"], balance=0.0, counts=counts)

@@ -18,7 +18,7 @@ conditions = [
 ]
 options = {"fluid": mpm.Fluid(bulk=1e8), "walls": {}, "gravity": (0, -9.81), "inertia": True}
 simulation = mpm.Simulation(grid, [block], [soil], conditions=conditions, **options)
-result = simulation.run(0.02, 0.004, energies=True, progress=False)
+result = simulation.run(0.02, 0.01, energies=True, progress=False)
 points = simulation.points
 if state := gathered(simulation, p=points.pressure, velocity=points.data["velocity"]):
     np.savez(

@@ -17,6 +17,6 @@ push = mpm.Displacement("top", lambda t, X: (0, -0.1 * t), region=((0, 0), (0.45
 acting = {"conditions": [push, mpm.Drained("right"), mpm.Drained("top", region=((0.45, 0), (3, 2)))]}
 walls = {"bottom": "xy", "left": "x"}
 simulation = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=walls, **acting)
-result = simulation.run(1.0, 0.25, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 if state := gathered(simulation):
     np.savez(sys.argv[1], **state, balance=result.balance)

@@ -25,6 +25,6 @@ simulation = mpm.Simulation(
     ],
     gravity=lambda t: (0, -9.81 * t),
 )
-result = simulation.run(1.0, 0.25, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 if state := gathered(simulation, p=simulation.points.pressure, stress=simulation.effective_stress()):
     np.savez(sys.argv[1], **state, balance=result.balance)

@@ -21,7 +21,7 @@ simulation = mpm.Simulation(
     gravity=(1.0, -9.81),
     inertia=mpm.Moving(lambda x: np.stack([np.where(x[:, 1] > 0.43, 0.3, 0.0), 0 * x[:, 1]], axis=1)),
 )
-result = simulation.run(0.05, 0.01, energies=True, progress=False)
+result = simulation.run(0.05, 0.025, energies=True, progress=False)
 data = simulation.points.data
 if state := gathered(simulation, velocity=data["velocity"], shear=data["tool_shear"]):
     np.savez(

@@ -14,10 +14,10 @@ soil = mpm.Hencky(bulk=4e7, shear=2e7, conductivity=1e-3)
 holds = [mpm.Displacement(side, (0, 0), axis) for side, axis in (("bottom", "y"), ("left", "x"), ("right", "x"))]
 options = {"fluid": mpm.Fluid(bulk=1e8), "walls": {}, "gravity": (0, -9.81), "inertia": False}
 simulation = mpm.Simulation(grid, [block], [soil], conditions=[*holds, mpm.Drained("top")], **options)
-simulation.run(100.0, 50.0, progress=False)
+simulation.run(100.0, 100.0, progress=False)
 quiet = [mpm.Quiet(side, lambda t: (0.1 * (t - 100), 0)) for side in ("bottom", "left", "right")]
 simulation.stage(inertia=True, conditions=[*quiet, mpm.Drained("top")], reset_displacement=True)
-result = simulation.run(100.2, 0.02, energies=True, progress=False)
+result = simulation.run(100.2, 0.05, energies=True, progress=False)
 points = simulation.points
 if state := gathered(simulation, p=points.pressure, velocity=points.data["velocity"], u=points.displacement):
     energies = [of[-1] for of in result.energies.values()]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from far_bodies import E, beside
 from scipy.optimize import brentq
-from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 
@@ -133,12 +132,3 @@ def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
     strain = s.points.F[s.points.material == 1, 1, 1] - 1
     assert strain == pytest.approx(np.full(len(strain), brentq(lambda a: np.log(a) / a - load, 1, 2) - 1), rel=1e-7)
     assert history[0][0] == pytest.approx(1.0) and history[-1][0] < 1e-8
-
-
-def test_parts_are_the_same_on_several_processes(tmp_path):
-    """A wet beam next to a stiff body that moves and drains, on one process and on three processes."""
-    for processes in (1, 3):
-        mpirun(processes, "mpi_parts.py", str(tmp_path / f"{processes}.npz"))
-    one, three = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 3))
-    for name, values in one.items():
-        assert three[name] == pytest.approx(values, abs=1e-8 * np.abs(values).max()), name

@@ -29,31 +29,69 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
 
 NAMES = (
     "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes "
-    "following division shared shaken"
+    "following division shared shaken parts few_cells probes"
 )
-NAMES = NAMES.split()
-SCENES = [*((f"mpi_{name}.py", (3,)) for name in NAMES), ("mpi_tools.py meshes", (3,)), ("mpi_probes.py", (2,))]
-SLOW = [
-    pytest.param(f"mpi_{name}.py", count, marks=pytest.mark.slow)
-    for name, count in (("wetting", (3,)), ("rain", (2, 3, 4)), ("tied", (2, 3)), ("following_3d", (2,)))
-]
-SLOW.append(pytest.param("mpi_contact.py axisymmetric", (2, 3), marks=pytest.mark.slow))
-SLOW.append(pytest.param("mpi_contact.py conducts", (2, 3), marks=pytest.mark.slow))
+SCENES = [*(f"mpi_{name}.py" for name in NAMES.split()), "mpi_tools.py meshes"]
+TOGETHER = {
+    1: ["mpi_exchange.py", *SCENES],
+    2: [f"mpi_{name}.py" for name in ("exchange", "refusals", "second_scene", "bodies")],
+    3: ["mpi_exchange.py", *SCENES, "mpi_bodies.py"],
+}
+"""Scripts that processes run one after the other, by number of processes."""
+SLOW = [(f"mpi_{name}.py", n) for name, n in (("wetting", (3,)), ("rain", (2, 3, 4)), ("tied", (2, 3)))]
+SLOW += [("mpi_following_3d.py", (2,)), *((f"mpi_contact.py {kind}", (2, 3)) for kind in ("axisymmetric", "conducts"))]
 
 
-@pytest.mark.parametrize("scene, several", SCENES + SLOW)
-def test_the_state_is_the_same_on_several_processes(scene, several, tmp_path):
-    states, (script, *options) = [], scene.split()
-    for processes in (1, *several):
-        file = tmp_path / f"{processes}.npz"
-        mpirun(processes, script, str(file), *options)
-        states.append(np.load(file))
-        assert len(states[-1]["counts"]) == processes and states[-1]["balance"] <= 1e-8
-    one, *others = states
-    for other in others:
-        assert other["x"] == pytest.approx(one["x"], abs=1e-10)
-        for name in set(other.files) - {"x", "tip", "balance", "counts"}:
-            assert other[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max())
+def together(processes):
+    """Return a fixture: the folder of the results of scripts on some processes."""
+
+    @pytest.fixture(scope="module")
+    def folder(tmp_path_factory):
+        return ran(tmp_path_factory.mktemp(f"processes-{processes}"), processes, TOGETHER[processes])
+
+    return folder
+
+
+def ran(folder, processes, scripts):
+    """Run scripts on some processes, and return the folder of their results."""
+    folder.mkdir(exist_ok=True)
+    mpirun(processes, "mpi_scenes.py", str(folder), *scripts)
+    return folder
+
+
+one, two, three = map(together, TOGETHER)
+
+
+def same(scene, one, others):
+    """Assert that a scene has the same results on one process, and on other numbers of processes (folders)."""
+    states = {processes: np.load(folder / f"{scene}.npz") for processes, folder in {1: one, **others}.items()}
+    for processes, state in states.items():
+        assert len(state["counts"]) == processes and state["balance"] <= 1e-8
+        assert state["x"] == pytest.approx(states[1]["x"], abs=1e-10)
+        for name in set(state.files) - {"x", "tip", "balance", "counts"}:
+            size = np.abs(states[1][name]).max()
+            assert state[name] == pytest.approx(states[1][name], abs=1e-8 * size), name
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_state_is_the_same_on_several_processes(scene, one, three):
+    same(scene, one, {3: three})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene, several", SLOW)
+def test_the_state_of_a_large_scene_is_the_same_on_several_processes(scene, several, tmp_path):
+    one, *others = (ran(tmp_path / str(processes), processes, [scene]) for processes in (1, *several))
+    same(scene, one, dict(zip(several, others, strict=True)))
+
+
+def test_scripts_that_check_themselves_end_without_an_error(one, two, three):
+    """Rows travel and are counted, all processes seed or refuse the same meshes, and raise the same errors.
+
+    A second scene on a grid is as even as alone. Earlier, the grid kept the distribution of the first scene, and of
+    bodies before their maps: one process had all points.
+    """
+    assert np.load(two / "mpi_second_scene.py.npz")["imbalance"].max() < 1.3
 
 
 def test_a_demo_of_several_processes_prints_what_one_does_or_is_refused(tmp_path, capsys, monkeypatch):
@@ -65,19 +103,6 @@ def test_a_demo_of_several_processes_prints_what_one_does_or_is_refused(tmp_path
         with pytest.raises(SystemExit):
             demo.main([*arguments, "--out", str(tmp_path)])
         assert "runs on one process, not 2" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("processes", [1, 2, 3])
-def test_rows_of_any_kind_travel_and_are_counted_whole(processes):
-    mpirun(processes, "mpi_exchange.py")
-
-
-def test_a_process_may_have_no_cell_and_no_face(tmp_path):
-    for processes in (1, 3):
-        mpirun(processes, "mpi_few_cells.py", str(tmp_path / f"{processes}.npz"))
-    one, three = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 3))
-    assert len(one) == 3 and all(top < -1e-6 for top in one.values())
-    assert three == pytest.approx(one, rel=1e-7)
 
 
 def test_no_process_is_left_without_a_cell_where_there_are_as_many():
@@ -128,36 +153,25 @@ def test_bodies_that_leave_their_processes_are_distributed_anew_with_the_same_an
         assert several[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max(), nan_ok=True), name
 
 
-def test_a_second_scene_on_a_grid_is_as_even_as_alone(tmp_path):
-    """Earlier, the grid kept the distribution of the first scene, and of bodies before their maps: one process had all
-    points.
-    """
-    mpirun(2, "mpi_second_scene.py", str(tmp_path / "out.npz"))
-    assert np.load(tmp_path / "out.npz")["imbalance"].max() < 1.3
+SHARES = [("1e4", ["boxes", "meshes"], 0.28), pytest.param("3e5", ["boxes"], 0.3, marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize("processes", [2, 3])
-def test_several_processes_seed_or_refuse_the_same_meshes(processes, tmp_path):
-    mpirun(processes, "mpi_bodies.py", str(tmp_path))
-
-
-MANY_POINTS = pytest.param("3e5", "boxes", 0.3, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("points, of, bound", [("1e4", "boxes", 0.28), ("1e4", "meshes", 0.28), MANY_POINTS])
-def test_no_process_holds_arrays_of_the_whole_scene(points, of, bound, tmp_path):
+@pytest.mark.parametrize("points, kinds, bound", SHARES)
+def test_no_process_holds_arrays_of_the_whole_scene(points, kinds, bound, tmp_path):
     """The excess over a quarter is due to borders between processes, and to uneven numbers of points.
 
     The largest shares are 0.266 of 1e4 points, and 0.265 of 3e5 points.
     """
+    scenes = {of: f"mpi_held.py {points} {of}" for of in kinds}
     for processes in (1, 4):
-        mpirun(processes, "mpi_held.py", str(tmp_path / f"{processes}.npz"), points, of)
-    one, four = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 4))
-    assert one["whole"][0] > 0 and not four["whole"].any(), "lengths of bodies and of the grid"
-    assert four["points"].sum() == one["points"][0] and (four["asked"] <= four["points"]).all()
-    assert four["asked"].sum() == one["asked"][0] > 0
-    print(f"shares: {four['held'] / one['held'][0]}")
-    assert (four["held"] < bound * one["held"][0]).all()
-    assert not one["files"].any() and four["files"].any() == (of == "meshes"), "one copy of a mesh on a machine"
-    size = (tmp_path / "1.checkpoint").stat().st_size
-    assert (four["written"] < 2 * size / 4).all() and (four["read"] < 3 * size / 4).all(), "shares of a checkpoint"
+        ran(tmp_path, processes, scenes.values())
+    for of, scene in scenes.items():
+        one, four = (dict(np.load(tmp_path / f"{scene}-{processes}.npz")) for processes in (1, 4))
+        assert one["whole"][0] > 0 and not four["whole"].any(), "lengths of bodies and of the grid"
+        assert four["points"].sum() == one["points"][0] and (four["asked"] <= four["points"]).all()
+        assert four["asked"].sum() == one["asked"][0] > 0
+        print(f"shares: {four['held'] / one['held'][0]}")
+        assert (four["held"] < bound * one["held"][0]).all()
+        assert not one["files"].any() and four["files"].any() == (of == "meshes"), "one copy of a mesh on a machine"
+        size = (tmp_path / f"{scene}-1.checkpoint").stat().st_size
+        assert (four["written"] < 2 * size / 4).all() and (four["read"] < 3 * size / 4).all(), "shares of a checkpoint"

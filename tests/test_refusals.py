@@ -9,7 +9,6 @@ import pytest
 import ufl
 from helpers import refused_in_one_line
 from test_bad_input import BODY, GRID, NAN, WATER, law, run, sand, scene, sides, soil
-from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.bodies.bodies import check_different
@@ -394,11 +393,6 @@ def test_conditions_bodies_and_probes_equal_only_themselves():
 
 def test_a_result_is_shown_in_a_line():
     assert len(repr(run(1.0, 0.01))) < 400
-
-
-def test_what_one_process_refuses_all_refuse():
-    """Otherwise the other processes would wait for ever."""
-    mpirun(2, "mpi_refusals.py")
 
 
 def test_mapped_bodies_are_not_integrated_at_points():
