@@ -28,12 +28,13 @@ def pushed(cells=8, renewal=True, wet=False, rings=False, **more):
     return mpm.Simulation(grid, [block], [CLAY], **options)
 
 
-if __name__ == "__main__":
+def main(file, *words):
+    """Write the state of a run of some kind, in two parts, or with "restart" from a checkpoint."""
     domains.LONGEST = 0.6  # cells: soon
-    file = Path(sys.argv[1])
-    kind = {"wet": "wet" in sys.argv, **{name: True for name in ("inertia", "rings") if name in sys.argv}}
+    file = Path(file)
+    kind = {"wet": "wet" in words, **{name: True for name in ("inertia", "rings") if name in words}}
     simulation = pushed(**kind)
-    if "restart" in sys.argv:
+    if "restart" in words:
         half = mpm.Checkpoint(file.with_suffix(".checkpoint"))
         simulation.run(0.06, 0.01, checkpoint=half, until=lambda s: s.t > 0.03, progress=False)
         simulation = pushed(**kind)
@@ -52,3 +53,7 @@ if __name__ == "__main__":
         of = dict(zip(titles, map(np.concatenate, zip(*parts, strict=True)), strict=True))
         more = {"force": simulation.tool_forces.array, "renewed": simulation.result.renewed}
         np.savez(file.with_suffix(".npz"), **{name: values[order] for name, values in of.items()}, **more)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
