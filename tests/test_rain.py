@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Rain infiltrates until the surface ponds, then runs off; water evaporates until the surface is dry."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import rain
@@ -208,7 +210,7 @@ def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirro
     water = {"fluid": fluid, "gravity": [0, -gravity], "pressure": -5000 * stress, "initial_stress": mpm.K0(0.5)}
     numerics = mpm.Numerics(tolerance=1e-9)
     s = mpm.Simulation(grid, bodies, soils, walls={"bottom": "xy"}, conditions=sides, numerics=numerics, **water)
-    assert s.run(4000 * time, 500 * time, progress=False).cuts == 0
+    assert s.run(2000 * time, 500 * time, progress=False).cuts == 0
     cells = s.cells()
     x = (cells.x - lower) / length
     pressure = cells.pressure[x[:, 0] < 1.8] / stress
@@ -216,6 +218,9 @@ def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirro
     x[:, 0] = 2 - x[:, 0] if mirror else x[:, 0]
     order = np.lexsort(np.round(x, 6).T)
     return pressure[order], s.outflows.array * time / length**2
+
+
+in_the_plain_frame = cache(two_soils_in_the_rain)
 
 
 @pytest.mark.parametrize(
@@ -231,8 +236,7 @@ def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirro
     ids=["large units", "small units", "mirrored", "reordered", "beside a far body", "far from the origin"],
 )
 def test_rain_on_two_soils_is_the_same_in_any_frame(other):
-    expected = two_soils_in_the_rain()
-    for found, value in zip(two_soils_in_the_rain(**other), expected, strict=True):
+    for found, value in zip(two_soils_in_the_rain(**other), in_the_plain_frame(), strict=True):
         assert found == pytest.approx(value, abs=1e-8 * np.abs(value).max())
 
 

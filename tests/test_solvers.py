@@ -4,6 +4,8 @@
 import gc
 import weakref
 from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -112,10 +114,28 @@ def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
     return mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[push, drained], fluid=mpm.Fluid())
 
 
-def pushed(bulk: float) -> list[Report]:
-    """Return the iterations of two steps of this cube."""
+class Pushed(NamedTuple):
+    """Reports of steps of a cube; iterations of its solves, and numbers of asked and of made factors."""
+
+    reports: list[Report]
+    counts: list[int]
+    asked: int
+    made: int
+
+
+@cache
+def pushed(bulk: float, steps: int = 2) -> Pushed:
+    """Return steps of an elastic cube with few shear stresses."""
     s = quarter_pushed(mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7), 8, 0.01)
-    return [s.step(1.0), s.step(1.0)]
+    counts, asked = [], []
+    solve, make = monolithic.BlockSolver.solve, monolithic.BlockSolver._factorised
+    PETSc.Log.begin()
+    before = PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
+        patch.setattr(monolithic.BlockSolver, "_factorised", lambda self: asked.append(1) or make(self))
+        reports = [s.step(1.0) for _ in range(steps)]
+    return Pushed(reports, counts, len(asked), PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"] - before)
 
 
 FRICTIONAL = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
@@ -154,14 +174,14 @@ def test_the_first_solve_of_a_step_leaves_little_of_both_residuals_whatever_give
     """A thousandth of the prescribed forces, the first residual, is as large as all other forces: it cost two more
     steps.
     """
-    for report in pushed(2e6):
+    for report in pushed(2e6).reports:
         assert max(report.history[0]) > 100 and max(report.history[1]) < 0.5 and report.newton <= 8
 
 
 @pytest.mark.parametrize("bulk", [50e6, 500e6])
 def test_nearly_incompressible_bodies_in_3d_take_few_iterations_a_solve(bulk):
     """nu = 0.49 and 0.499. With multigrid alone, the second takes 60 iterations per solve."""
-    report = pushed(bulk)[1]
+    report = pushed(bulk).reports[1]
     assert report.coupling < 15 * report.newton
 
 
@@ -196,29 +216,21 @@ def test_sweeps_replace_incomplete_factors_in_nearly_incompressible_soil_and_sol
     assert other.points.pressure == pytest.approx(one.points.pressure, abs=1e-5 * np.abs(one.points.pressure).max())
 
 
-def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many_iterations(monkeypatch):
-    counts, solve = [], monolithic.BlockSolver.solve
-    monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
-    pushed(50e6)
-    assert max(counts) < THRESHOLDS.many  # 38 without foresight
+def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many_iterations():
+    assert max(pushed(50e6).counts) < THRESHOLDS.many  # 38 without foresight
 
 
 def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatch):
     """The factors belong to the previous tangent, and the matrix is the present one."""
-    few = pushed(500e6)[0]
+    few = pushed(500e6).reports[0]
     thresholds(monkeypatch, fallback_3d=0)
-    many = pushed(500e6)[0]
+    (many,) = pushed.__wrapped__(500e6, steps=1).reports
     assert few.coupling < many.coupling / 3
     assert few.stress == pytest.approx(many.stress, rel=1e-7) and few.change == pytest.approx(many.change, rel=1e-5)
 
 
-def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tangents(monkeypatch):
-    PETSc.Log.begin()
-    asked, make = [], monolithic.BlockSolver._factorised
-    monkeypatch.setattr(monolithic.BlockSolver, "_factorised", lambda self: asked.append(1) or make(self))
-    before = PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"]
-    pushed(500e6)
-    assert PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"] - before == len(asked) > 0
+def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tangents():
+    assert pushed(500e6).made == pushed(500e6).asked > 0
 
 
 def test_water_flows_through_a_body_whose_nodes_are_all_held():
