@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Every demo runs at quick settings, writes its pictures and prints its results as JSON."""
 
+import contextlib
+import io
 import json
-import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -31,7 +34,7 @@ QUICK = {
     "strip": ("--cells 8 --steps 4", ["strip.png"]),
     "cryer": ("--cells 6 --steps 12", ["cryer.png"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
-    "cycles": ("--h 0.1 --cycles 2 --turn 0.25", ["cycles.png", "cycles.csv"]),
+    "cycles": ("--h 0.1 --cycles 2 --undrained 2 --turn 0.25 --steps 4", ["cycles.png", "cycles.csv"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
     "extreme_cases": (
@@ -45,7 +48,7 @@ QUICK = {
     "penetration": ("--cells 4 --rough 0.5 --depth 0.1 --wet-depth 0.05", ["penetration.png"]),
     "cone": ("--cells 2 --depth 0.5 --wet-depth 2", ["cone.png"]),
     "retaining_wall": ("--cells 6 --delta 0 --ways active", ["retaining_wall.png"]),
-    "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
+    "barrier": ("--cells 5 --steps 20", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "landslide": ("--cells 4 --dt 0.2", ["landslide.png"]),
     "collapse": ("--aspects 0.5 --finer 0.5 --steps 13", ["collapse.png"]),
@@ -57,7 +60,7 @@ QUICK = {
     "vibration": ("--h 0.1 --cells 8 --periods 1 --steps 16", ["vibration.png"]),
     "wave": ("--cells 8 --steps 10 --periods 2", ["wave.png"]),
     "shaking": ("--cells 4 --steps 60 --bank-cells 4 --bank-steps 20", ["shaking.png"]),
-    "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
+    "dam": ("--h 1 --steps 1 --cells 10", ["dam.png"]),
     "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
@@ -72,9 +75,22 @@ LONG |= {"collapse", "cone"}
 
 
 def run(demo, arguments):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, ROOT / "demos" / f"{demo}.py", *arguments.split()]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+    """Run a demo as its command line does, but in this process, which starts once for all demos."""
+    out, err, given = io.StringIO(), io.StringIO(), sys.argv
+    file = ROOT / "demos" / f"{demo}.py"
+    sys.argv, returncode = [str(file), *arguments.split()], 0
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            runpy.run_path(str(file), run_name="__main__")
+    except SystemExit as end:
+        returncode = end.code
+        if isinstance(end.code, str):
+            returncode = 1
+            print(end.code, file=err)
+    finally:
+        sys.argv = given
+        plt.close("all")
+    return SimpleNamespace(returncode=returncode, stdout=out.getvalue(), stderr=err.getvalue())
 
 
 def test_every_demo_is_run():
