@@ -167,14 +167,16 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_what_a_run_that_was_broken_off_has_left_ends_no_later_one(damage, compiled, tmp_path):
-    cache = shutil.copytree(compiled, tmp_path / "cache")
-    for kind in ("elements", "forms"):  # of later releases there are forms only
-        for source in sorted(cache.glob(f"fenics/*{kind}*.c"), key=lambda file: file.stat().st_size)[-1:]:
-            damage(next(cache.glob(f"fenics/{source.stem}.*so")), source)
-    assert ended(start(XDG_CACHE_HOME=cache)) == ONE
-    assert not list(cache.glob("fenics/.*"))
+def test_what_a_run_that_was_broken_off_has_left_ends_no_later_one(compiled, tmp_path):
+    """As many runs as it takes to damage a library in each way; of later releases there are few libraries."""
+    damages, runs = list(DAMAGE.values()), 0
+    while damages:
+        cache = shutil.copytree(compiled, tmp_path / f"{(runs := runs + 1)}")
+        for source in sorted(cache.glob("fenics/*.c"), key=lambda file: file.stat().st_size, reverse=True):
+            if damages:
+                damages.pop(0)(next(cache.glob(f"fenics/{source.stem}.*so")), source)
+        assert ended(start(XDG_CACHE_HOME=cache)) == ONE
+        assert not list(cache.glob("fenics/.*"))
 
 
 def compiling(folder):
@@ -278,7 +280,7 @@ def script(*arguments, **options):
 
 
 def test_a_demo_runs_on_two_processes_also_as_root(tmp_path):
-    beam = ("poroelastic_beam", "--h", "0.1", "--t-end", "0.1", "--out", tmp_path)
+    beam = ("poroelastic_beam", "--h", "0.1", "--t-end", "0.04", "--out", tmp_path)
     end = script(ROOT / "demos" / "run.sh", "-n", "2", *beam)
     assert end["returncode"] == 0, end["stderr"]
     assert (tmp_path / "pressure.png").exists()
