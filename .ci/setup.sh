@@ -12,12 +12,14 @@ modules=(dolfinx scipy tqdm meshio matplotlib)
 # One thread per process; pictures without a display; mpirun as root, as in a container; messages
 # through shared memory, for everything runs on one machine (and Open MPI 5 warns about its network); more
 # processes than cores are allowed (Open MPI 4's name for it, and 5's), and those that wait leave the core to others.
+# Processes are bound to no core: otherwise Open MPI binds those of two runs at a time to the same cores.
 # A process of its own has no daemon of Open MPI 4 beside it, whose end would be its own, without a word.
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 export MPLBACKEND="${MPLBACKEND:-Agg}"
 export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
 export OMPI_MCA_btl="${OMPI_MCA_btl:-^tcp}" OMPI_MCA_rmaps_base_oversubscribe=1 OMPI_MCA_mpi_yield_when_idle=1
 export OMPI_MCA_ess_singleton_isolated=1
+export OMPI_MCA_hwloc_base_binding_policy=none PRTE_MCA_hwloc_default_binding_policy=none
 export PRTE_MCA_rmaps_default_mapping_policy="${PRTE_MCA_rmaps_default_mapping_policy:-:oversubscribe}"
 
 say() { echo "$*" >&2; }

@@ -12,5 +12,6 @@ if [ "${1-}" = --release ]; then
     exec bash tests/release.sh "${@:2}"
 fi
 setup pytest pytest-xdist hypothesis gmsh h5py pandas xarray
+unset PYTHONDONTWRITEBYTECODE # every process that a test starts would compile the modules again
 [ $# -gt 0 ] || set -- -n "$(env -u OMP_NUM_THREADS nproc)" --dist loadfile
 exec "$python" -m pytest "$@" # of tests/, says pyproject.toml
