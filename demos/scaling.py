@@ -95,22 +95,22 @@ def sent() -> np.ndarray:
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
 
 
-def measure(dim: int, points: float) -> dict:
-    """Return the costs of the fastest step of a run; all processes must call this function."""
+def measure(dim: int, points: float, count: int = STEPS) -> dict:
+    """Return the costs of the fastest of `count` steps after the first; all processes must call this function."""
     PETSc.Log.begin()
     began = time.perf_counter()
     simulation, dt = scene(dim, points)
     first = simulation.run(dt, dt, progress=False)
     comm, setup, before = simulation.grid.comm, time.perf_counter() - began, sent()
     steps = []
-    for _ in range(STEPS):
+    for _ in range(count):
         start = time.process_time()
         result = simulation.run(simulation.t + dt, dt, progress=False)
         steps.append((comm.allreduce(time.process_time() - start, MPI.MAX), result))
     seconds, best = min(steps, key=lambda step: step[0])
     profile = {part: wall * seconds / best.wall for part, wall in best.profile.items()}
     on_grid, matrices = simulation.scene.last
-    most = np.max(comm.allgather((sent() - before) / STEPS), axis=0).tolist()
+    most = np.max(comm.allgather((sent() - before) / count), axis=0).tolist()
     counted = comm.allgather(held(simulation)[0])
     names = ("exchange_messages", "exchange_bytes", "solver_messages", "solver_bytes", "solver_reductions")
     return {
@@ -177,9 +177,9 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
     return out | sums, lengths
 
 
-def in_own_process(dim: int, points: float, processes: int) -> dict:
+def in_own_process(dim: int, points: float, processes: int, count: int = STEPS) -> dict:
     """Run `measure` in a new process, or in several new processes, and return its result."""
-    command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
+    command = [sys.executable, "-m", "mpi4py", __file__, "--one", *map(str, (dim, points, count))]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
     # Open MPI: a waiting process yields the processor, so that times do not depend on other work
@@ -350,13 +350,13 @@ def main(argv: list[str] | None = None) -> dict:
     size.add_argument("--largest", action="store_true", help="up to 1e6 points in 2D, 3e5 in 3D: a quarter of an hour")
     size.add_argument("--points", type=float, nargs="+", help="numbers of points, instead of the default sizes")
     add("--processes", type=int, nargs="+", default=[1], help="numbers of processes; under mpirun: its own")
-    add("--one", nargs=2, help=argparse.SUPPRESS)  # a run in a process of its own: dimension, points
+    add("--one", nargs=3, help=argparse.SUPPRESS)  # a run in a process of its own: dimension, points, steps
     o = parser.parse_args(argv)
     if min(o.processes) < 1:
         parser.error(f"--processes {min(o.processes)}: must be >= 1")
     comm = MPI.COMM_WORLD
     if o.one:
-        row = measure(int(o.one[0]), float(o.one[1]))
+        row = measure(int(o.one[0]), float(o.one[1]), int(o.one[2]))
         if comm.rank == 0:
             print(json.dumps(row))
         return {"converged": True}
