@@ -9,6 +9,8 @@ import self_weight_column
 import terzaghi
 from helpers import rates
 
+consolidated = cache(terzaghi.run)
+
 # ---- Terzaghi: in space, against the exact solution of what backward Euler leaves of the equation ----
 
 
@@ -38,7 +40,7 @@ def test_consolidation_is_of_second_order_in_the_cell_size(which, ceiling):
 def test_consolidation_in_time_is_of_the_order_of_the_method(method, order):
     """Errors of cell pressures at T_v = 0.5 and 1, compared with a run in which the error in time is negligible."""
     runs = [terzaghi.run(20, steps, method=method) for steps in (10, 20, 40)]
-    true = terzaghi.run(20, 640)
+    true = consolidated(20, 640)
     for time in (0.5, 1.0):
         errors = [np.abs(out.p[out.at(time)] - true.p[true.at(time)]).max() for out in runs]
         assert rates(errors).min() > order, errors
@@ -59,7 +61,7 @@ def test_steps_chosen_by_their_error_keep_to_it():
 def test_consolidation_does_not_depend_on_how_small_the_load_is(strain):
     """Domains that leave their cells by very small distances must not close the faces between cells."""
     p = terzaghi.run(50, 50, strain).p
-    assert max(np.abs(a - b).max() for a, b in zip(p, terzaghi.run(50, 50).p, strict=True)) < 3 * max(strain, 1e-5)
+    assert max(np.abs(a - b).max() for a, b in zip(p, consolidated(50, 50).p, strict=True)) < 3 * max(strain, 1e-5)
 
 
 # ---- column under its own weight ----
