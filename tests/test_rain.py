@@ -380,3 +380,30 @@ def test_infiltration_and_evaporation_are_those_of_richards_equation():
     assert entered[0] == pytest.approx(exact[0], rel=2e-3)
     assert entered[0] - np.array(entered[1:]) == pytest.approx(exact[0] - exact[1:], rel=1.5e-2)
     assert exact[0] - exact[2] < 0.3 * 1e-7 * 20 * 86400  # the soil limits evaporation
+
+
+@pytest.mark.slow
+def test_nearly_empty_cells_of_a_bank_do_not_stop_its_evaporation():
+    """Loam over sand swells in rain, by up to 1e-4 cells above a grid line.  These cells dry first."""
+    half, slope = 43200.0, np.arctan2(4, 6)
+    grid = mpm.Grid([0, 0], [18, 8], [18, 16])
+    edges = [(0, 2), (18, 2), (18, 3), (12, 3), (6, 7), (0, 7)]
+    bank = mpm.polygon(grid, edges, ["bed", "end", "toe", "slope", "crest", "axis"])
+    of_loam = {"porosity": 0.43, "conductivity": 2.9e-6, "retention": mpm.VanGenuchten(2725.0, residual=0.18, n=1.56)}
+    of_sand = {"porosity": 0.4, "conductivity": 8e-5, "retention": mpm.VanGenuchten(677.0, residual=0.1, n=2.68)}
+    loam = mpm.MohrCoulomb(bulk=8e6, shear=4e6, friction=28, dilation=0, cohesion=5e3, **of_loam)
+    sand = mpm.MohrCoulomb(bulk=3e7, shear=1.5e7, friction=36, dilation=4, cohesion=500, **of_sand)
+    rain = mpm.Stepwise([0, half], [5e-6, -3e-8])
+    inclined = mpm.Stepwise([0, half], np.cos(slope) * np.array([5e-6, -3e-8]))
+    sides = [mpm.Rain("crest", rain, ponding=300.0), mpm.Rain("toe", rain), mpm.Rain("slope", inclined)]
+    sides.append(mpm.Drained("right", mpm.hydrostatic(1.5)))
+    scene = {"walls": {"left": "x", "right": "x", "bottom": "xy"}, "fluid": mpm.Fluid(), "gravity": (0, -9.81)}
+    scene |= {"conditions": sides, "pressure": mpm.hydrostatic(1.5), "initial_stress": mpm.K0(0.5)}
+    s = mpm.Simulation(grid, [bank, mpm.box(grid, [0, 0], [18, 2], material=1)], [loam, sand], **scene)
+    start = water(s)
+    result = s.run(4 * half, rtol=1e-2, t_eval=[half, 4 * half], progress=False)
+    assert result.cuts <= 2
+    assert result.steps < 60
+    assert s.cells().pressure.min() > -1e7
+    assert water(s) - start == pytest.approx(-s.outcome("flowed").array.sum(), abs=1e-8 * start)
+    assert s.outcome("rained").array.sum() == pytest.approx(18 * half * (5e-6 - 3 * 3e-8), rel=1e-4)
