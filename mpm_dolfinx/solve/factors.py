@@ -81,7 +81,12 @@ def solved(ksp: PETSc.KSP, name: str) -> int:
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
-        raise NotConverged(f"the linear solver of the {name} failed after {count} iterations (PETSc reason {reason})")
+        why = (
+            "values are not finite"
+            if reason == PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
+            else f"PETSc reason {reason}"
+        )
+        raise NotConverged(f"the linear solver of the {name} failed after {count} iterations ({why})")
     return count
 
 
