@@ -26,6 +26,7 @@ simulation = mpm.Simulation(
         mpm.Traction("top", lambda t: (0, -3e4 * min(1, t / 1e4)), region=((0, 0), (0.9, 2))),
         mpm.Inflow("top", 4e-7),
     ],
+    numerics=mpm.Numerics(tolerance=1e-10),
 )
 result = simulation.run(1e5, 2.5e4, progress=False)
 points = simulation.points
