@@ -552,8 +552,7 @@ class Assembled(Keyed):
             if (form := storage.fluxes.nonorthogonal) is not None:
                 self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
         self._gradients: Latest[Gradients | None] = Latest()
-        self._conductivities: Latest[NDArray[np.float64] | None] = Latest()
-        self._fills: Latest[NDArray[np.float64] | None] = Latest()
+        self._of_cells: Latest[tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]] = Latest()
 
     @property
     def solvers(self) -> LinearSolvers:
@@ -611,19 +610,19 @@ class Assembled(Keyed):
 
         def fit() -> Gradients | None:
             needed = self._off.some or off_middle(sides, grid).any()
-            return Gradients(contents, sides, kappa, fill) if needed else None
+            return Gradients(contents, sides, *of_cells) if needed else None
 
-        def conductivities() -> NDArray[np.float64] | None:
-            return self._fluxes.unequal(contents.filled, mobility(True).mean)
+        def mobility_and_fill() -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+            unequal = partial(self._fluxes.unequal, contents.filled)
+            return unequal(mobility(True).mean) if layered else None, unequal(contents.fill) if unsaturated else None
 
-        mixture, kappa, fill = (), None, None
+        layered, unsaturated = on_grid.layered and not self._varies, on_grid.scale is not None
+        mixture, of_cells = (), (None, None)
         if self._by_pressure is not None:
             mixture = (self._by_pressure.x.array[on_grid.cells],)
             varies = (*varies, *mixture)
-        if self._off is not None and on_grid.layered and not self._varies:
-            kappa = self._conductivities((), conductivities, grid.comm)
-        if self._off is not None and on_grid.scale is not None:
-            fill = self._fills((), lambda: self._fluxes.unequal(contents.filled, contents.fill), grid.comm)
+        if self._off is not None and (layered or unsaturated):
+            of_cells = self._of_cells((), mobility_and_fill, grid.comm)
         where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
         gradients = None if self._off is None else self._gradients(where, fit)
         off = gradients and (self._off, gradients, sides)
