@@ -106,6 +106,20 @@ def test_a_separate_body_that_stands_does_not_change_the_factor():
         assert safety(cut(0.5, far), rtol=0.02).bounds == pytest.approx(alone, rel=1e-9)
 
 
+@pytest.mark.parametrize("t_end", [None, 1.0, 3.0])
+def test_jumps_of_loads_before_and_after_the_present_do_not_count(t_end):
+    """Earlier, trials ended steps at jumps, and took loads from before the first time or before the last jump."""
+    top = {"side": "top", "region": ((0, 0.3), (0.5, 1))}
+    loads = mpm.Stepwise([0.0, 2.0, 3.5], [(0, -LOAD), (0, -1.2 * LOAD), (0, -0.5 * LOAD)])
+    s = block([CLAY], run=False, load=0.0, conditions=[mpm.Traction(**top, value=loads)])
+    if t_end:
+        s.run(t_end, 1.0, progress=False)
+    found = [mpm.factor_of_safety(s, dt=dt, rtol=0.005).factor for dt in (None, 10.0)]
+    assert found[0] == found[1]
+    if t_end != 3.0:
+        assert found[0] == pytest.approx(EXACT, rel=0.005)
+
+
 @pytest.mark.slow
 def test_deep_soft_soil_hardly_changes_the_factor():
     """E / (gamma H) = 66.  With rtol = 0.005, F was 1.70 on ground of depth 2 m, and 2.20 at 0.5 m."""

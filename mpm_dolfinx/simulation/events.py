@@ -37,6 +37,9 @@ class Simulated(Protocol):
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
         """Return the state after a step of length `dt`, in s, and the report of the step."""
 
+    def without_jump(self, dt: float) -> float:
+        """Return the length of a step, in s: `dt`, or less if a function of time jumps in the step."""
+
 
 class Step(NamedTuple):
     """A completed step."""

@@ -294,32 +294,29 @@ class Simulation:
     ) -> None:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        Stresses and pressures do not change until the next `run`, which finds the new equilibrium.
-        If all arguments are the present values, the state does not change.
+        Stresses and pressures change in the next `run`.  Present values as arguments do not change the state.
 
         Parameters
         ----------
         walls, gravity
             New walls and new gravity, as for `Simulation`.  A scene without gravity cannot get gravity later.
         inertia
-            Whether bodies have inertia from now on; a scene created with `inertia=None` cannot have inertia.  Bodies
-            that get inertia start without velocity.
+            Whether bodies have inertia, beginning without velocity; not in a scene created with `inertia=None`.
         conditions
             All conditions from now on; by default the present conditions.  To add a condition `new`, pass
             `[*simulation.conditions, new]`.  Every `Contact` remains in force, even if it is not listed.
         add
-            Indices of bodies that are `Later`, for example a fill.  Added bodies have no velocity.  Added bodies have
-            an initial stress only if `initial_stress` lists them.  A fill is added to the present surface of the bodies
-            that it touched at seeding.  The free sides of the fill remain at their seeded positions.
+            Indices of bodies that are `Later`, for example a fill.  They have no velocity, and an initial stress only
+            if `initial_stress` lists them.  A fill is added to the present surface of the bodies that it touched at
+            seeding.  The free sides of the fill remain at their seeded positions.
         remove
             Indices of bodies to be removed, for example by an excavation.
         reset_displacement
             Whether displacements are measured from the present positions from now on. Values of conditions do not
             change: a present `Displacement` with the value d then moves its side by another d.
         fields
-            New values of entries of `points.data`, by name.  A value is an array (n, ...) for the n points of this
-            process, or one value for all points.  An entry is a state variable of a law, a material constant that
-            varies with position, or data of the user.
+            New values of `points.data`, by name: arrays (n, ...) for the n points of this process, or one value for
+            all.  These are state variables of laws, material constants that vary with position, and data of the user.
 
         Raises
         ------
@@ -355,5 +352,9 @@ class Simulation:
             self.scene.forget()
             raise_interrupt(error)
             raise
+
+    def without_jump(self, dt: float) -> float:
+        """Return the length of a step, in s: `dt`, or less if a function of time jumps in the step."""
+        return self._state.stage.without_jump(self._state.t, dt)
 
     run, tangent = run, tangent

@@ -107,7 +107,7 @@ def factor_of_safety(
     Parameters
     ----------
     simulation
-        Scene with its loads, which keep their present values.
+        Scene with its loads, which keep their present values.  If a load jumps now, the value after the jump counts.
     dt
         Length of a step, in s, > 0.  Default: if fluid flows in the scene, pore pressures keep their present values.
         With a given length, fluid flows in the trials too: a short step leads to undrained failure, and a long step to
@@ -211,17 +211,25 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """Scene and state of a trial for the time loop, with the number of Newton steps in each time step."""
+    """Scene and state of a trial for the time loop, with the number of Newton steps in each time step.
+
+    Loads keep their values at the time `present`, in s.
+    """
 
     scene: Scene
     state: State
     newton: list[int]
+    present: float
 
     def advanced(self, dt: float) -> tuple[State, Report]:
         """Return the state after a step of length `dt`, in s, and the report of the step."""
-        state, report = step(self.scene, self.state, dt)
+        state, report = step(self.scene, replace(self.state, t=self.present - dt), dt)
         self.newton.append(report.newton)
-        return state, report
+        return replace(state, t=self.state.t + dt), report
+
+    def without_jump(self, dt: float) -> float:
+        """Return `dt`, because loads do not jump."""
+        return dt
 
 
 class _Weakened:
@@ -270,7 +278,7 @@ class _Weakened:
         self._strengths, self.newton = _strengths(scene, initial.points), []
         points = replace(initial.points, data={**initial.points.data, **self._strengths, CREEP: 0 * initial.points.J})
         initial = begin_stage(self._scene, replace(initial, points=points), {}, [], [], False, {})
-        start = self._unyielding(replace(initial, t=initial.t - dt))
+        start = self._unyielding(initial)
         stress = self._scene.materials.effective_stress_3d(start.points)
         _check_stress(self._scene, start.points, stress)
         part, self._parts = self._scene.on_grid(start.points).parts
@@ -306,13 +314,13 @@ class _Weakened:
     def _trial(self, start: State, data: Mapping[str, NDArray[np.float64]]) -> _Trial:
         """Return a trial that starts from the state `start`, but with the new values `data` of point data."""
         points = replace(start.points, data={**start.points.data, **data})
-        return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
+        start = replace(start, points=points, velocity=None, result=None, control=None)
+        return _Trial(self._scene, start, self.newton, start.t)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
         """Compute a step of a trial.  `what`: description of the soil for an error message."""
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
-            trial.state = replace(trial.state, t=trial.state.t - self._dt)  # loads keep their values
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 

@@ -308,7 +308,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         result = simulation.state.result
         control = simulation.state.control
         size, how = rule.fitted(target - state.t, control.small), ()
-        size = state.stage.without_jump(state.t, size)
+        size = simulation.without_jump(size)
         preferred, whole = preferred or rule.preferred(size), whole or size
         try:
             new, report = simulation.advanced(size)
