@@ -43,8 +43,6 @@ DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
-_replacements: dict[Path, Path] = {}
-"""For each cache folder that is not writable: the temporary folder that replaces it."""
 _warnings: dict[Path, str] = {}
 """For each temporary folder: the warning that the first compilation in this folder issues."""
 
@@ -77,24 +75,23 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
 MAKERS = [name for name in ("compile_forms", "compile_elements") if hasattr(libraries, name)]
 
 
+@cache
 def _folder() -> Path:
-    """Return the folder for libraries: dolfinx's cache, or a temporary folder if the cache is not writable."""
+    """Return the folder for libraries in this run: dolfinx's cache, or a temporary folder if it is not writable."""
     try:
         _ffcx_settings()
-        cache = _settings()["cache_dir"]
+        folder = _settings()["cache_dir"]
     except (OSError, ValueError) as error:  # ValueError: not JSON
         file, why = getattr(error, "filename", None), getattr(error, "strerror", None)
         what = f"{file}: {why}" if file else f"dolfinx_jit_*.json or ffcx_*.json: {line_of(error)}"
         allowed = "must be absent, or JSON that can be read; set HOME or XDG_CONFIG_HOME to another folder"
         raise OSError(f"{what}; settings of dolfinx {allowed}") from error
     try:
-        cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=WORKSHOP, dir=cache):
-            return cache
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=WORKSHOP, dir=folder):
+            return folder
     except OSError as error:
-        if cache not in _replacements:
-            _replacements[cache] = _of_this_run(cache, error)
-        return _replacements[cache]
+        return _of_this_run(folder, error)
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
@@ -118,19 +115,20 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
 
     def find_or_make(*objects, cache_dir, **settings):
         workshop, find = folder / f"{WORKSHOP}{uuid4().hex}", libraries.get_cached_module
+        missing = []
 
         def look(name: str, names, workshop, timeout):
             for place in dict.fromkeys((Path(cache_dir), folder)):
                 with suppress(OSError, ImportError, AttributeError):  # unreadable, or another file of this name
-                    if _is_complete(place, name):
-                        module = _loaded(name, _library(place, name))
-                        return [getattr(module.lib, one) for one in names], module
+                    module = _loaded(name, place)
+                    return [getattr(module.lib, one) for one in names], module
+            missing.append(name)
             return find(name, names, workshop, timeout)  # finds nothing and creates the workshop
 
         try:
             with _replaced(get_cached_module=look):
                 out = make(*objects, cache_dir=workshop, **settings)
-            if workshop.exists():
+            if missing:
                 if folder in _warnings:
                     logger.warning(_warnings.pop(folder))
                 with suppress(OSError):  # the library is already loaded; a later run compiles it again
@@ -145,15 +143,18 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
             messages.append(f"{folder}: {line_of(error)}, {allowed}")
             raise
         finally:
-            shutil.rmtree(workshop, ignore_errors=True)
+            if missing:
+                shutil.rmtree(workshop, ignore_errors=True)
 
     return find_or_make
 
 
 @cache
-def _loaded(name: str, library: Path) -> ModuleType:
-    """Return a library as a Python module.  FFCx's loader is slower, because it lists the whole cache."""
-    spec = spec_from_file_location(name, library)
+def _loaded(name: str, place: Path) -> ModuleType:
+    """Return a complete library as a module, or raise ImportError.  FFCx's loader is slower: it lists the cache."""
+    if not _is_complete(place, name):
+        raise ImportError(name)
+    spec = spec_from_file_location(name, _library(place, name))
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
