@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Domains of yielded soil keep the volumes of their points, so that no cell is filled beyond its volume."""
 
+from dataclasses import replace
+
 import common
 import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.diagnostics.resolution import warn_overlaps
+from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import volume_slopes
 from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
 from mpm_dolfinx.points.cutting import corner_bits, cut, domain_volumes, simplex_volumes, vertices
@@ -112,6 +116,22 @@ def test_folded_domains_fill_no_cell_twice(dim):
     middle = np.stack([np.bincount(pieces.cell, pieces.fraction * size[pieces.point] * x) for x in pieces.x.T], axis=1)
     index = np.stack(np.unravel_index(np.arange(grid.cells), grid.shape), axis=1)
     assert middle == pytest.approx(index + 0.5, abs=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_domains_that_are_largely_inverted_are_reported(dim, warned):
+    """Corners move alternately along a diagonal. Domains fill cells to 100 %, and earlier there was no warning."""
+    grid = mpm.Grid([0.0] * dim, [6.0] * dim, [3] * dim)
+    clay = mpm.MohrCoulomb(bulk=1e6, shear=1e6, friction=0.0, dilation=0.0, cohesion=1e3)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0.0] * dim, [6.0] * dim)], [clay], walls={"bottom": "xyz"[:dim]})
+    X = s.points.corners
+    inner = (np.abs(X[..., :2] - 3) < 2.5).all(axis=2)
+    along = np.where(X[..., :2].sum(axis=2) % 2 < 0.5, 1.0, -1.0) * inner
+    for fold, messages in ((0.6, 0), (0.8, 1)):
+        corners = X + fold * along[..., None] * (np.arange(dim) < 2)
+        points = replace(s.points, corners=corners, volume0=domain_volumes(corners, False))
+        warn_overlaps(CutDomains(grid, points, True), s.bodies, evolves=True)
+        assert len([one for one in warned() if "partly inverted" in one]) == messages
 
 
 @pytest.mark.parametrize(("dim", "axisymmetric"), [(2, False), (2, True), (3, False)])

@@ -19,7 +19,7 @@ from mpm_dolfinx.domains.bending import followed
 from mpm_dolfinx.domains.renewed_faces import PARENT, ROOT, RenewedFaces, on_parts, renewed_faces
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
-from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
+from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces, simplex_volumes, vertices
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
@@ -196,6 +196,11 @@ class CutDomains(Keyed):
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
         whole, total = (sum_by(self.pieces.point, area * each, len(self.points)) for each in (1.0, values))
         return total / whole
+
+    def unfolded(self) -> NDArray[np.float64]:
+        """Return the volumes (n,) of the parts of domains that are not inverted, divided by the domain volumes."""
+        volumes = simplex_volumes(vertices(self.points.corners.transpose(1, 2, 0).copy()))
+        return np.maximum(volumes, 0.0).sum(axis=0) / volumes.sum(axis=0)
 
     def surface(self, faces: Surface) -> Patches:
         """Return the quadrature points on a surface, for faces of points on this process.

@@ -130,7 +130,8 @@ class Scene:
         keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
         self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
         # checks still to be made, which only write to the log
-        self._looks = (warn_overlaps, *[partial(warn_mixed, materials=scene)] * scene.varied)
+        mixed = [partial(warn_mixed, materials=scene)] * scene.varied
+        self._looks = (partial(warn_overlaps, evolves=scene.evolves), *mixed)
         self._assembled: Latest[Assembled] = Latest()
         self._on_grid: Latest[OnGrid] = Latest(self._assembled)
         self._systems: Latest[System] = Latest()
