@@ -381,6 +381,18 @@ def test_a_tool_that_would_be_behind_a_beam_after_a_step_bends_it():
     assert s.points.x[:, 1].min() < 0.71 - 0.23 and np.linalg.norm(s.tool_forces.array[0, :2]) > 100
 
 
+@pytest.mark.parametrize(("edge", "step"), [(0.35, 0.05), (0.35, 0.025), (0.45, 0.125)])
+def test_the_corner_of_a_tool_bends_a_beam_although_the_motion_of_points_opens_the_contact(edge, step):
+    """Earlier, a Newton step without contact moved the beam to the far side of the tool, for any length of the step."""
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
+    beam = mpm.box(grid, [0, 0.6], [0.6, 0.7])
+    shape = mpm.Convex([[edge, 0.71], [0.8, 0.71], [0.8, 0.81], [edge, 0.81]])
+    tool = mpm.Tool(shape, displacement=lambda t: (0, -0.23 * t))
+    s = mpm.Simulation(grid, [beam], [SOIL], walls={"left": "xy"}, conditions=[tool])
+    s.run(1.0, step, progress=False)
+    assert s.tool_forces.array[0, 1] < -100
+
+
 def test_a_function_is_a_shape_like_another():
     forces = []
     for shape in (mpm.Ball((0.5, 0.8), 0.2), lambda y: np.hypot(y[:, 0] - 0.5, y[:, 1] - 0.8) - 0.2):

@@ -88,7 +88,9 @@ class ToolPairs(Pairs):
     poses: Sequence[Pose]  # poses of tools at the end of the substep, without motion by loads in the step (contacts,)
     now: NDArray[np.float64]  # position of the point at the start of the step (m, d), m
     carried: NDArray[np.float64]  # position `now` after the motion of the tool (m, d), m
-    start_gap: NDArray[np.float64]  # gap at the start of the step (m,), m; 0 in statics
+    start_gap: NDArray[np.float64]  # gap at the start of the step (m,), m
+    side_gap: NDArray[np.float64]  # gap of the position `now` from the tool in its pose `poses` (m,), m
+    side: NDArray[np.float64]  # outward unit normal of the tool there (m, d)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
@@ -119,6 +121,11 @@ class ToolPairs(Pairs):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
         together(self.grid.comm, ask)
+        # in an iteration, a point may pass through the tool; its gap then refers to the side of the tool it came from
+        behind = np.flatnonzero(np.einsum("md,md->m", n, self.side) < 0)
+        n[behind], second[behind] = self.side[behind], 0.0
+        moved = (w - carried + self.carried)[behind]
+        gap[behind] = self.side_gap[behind] + np.einsum("md,md->m", n[behind], moved)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property

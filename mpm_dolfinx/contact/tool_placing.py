@@ -206,8 +206,8 @@ class Tools(Touching):
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
-            n = together(grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
-            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
+            n = self._normals(tool, pose, x)
+            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = (
                 points.data[shear_name(self.names[number])][patches.at[at]]
@@ -215,21 +215,25 @@ class Tools(Touching):
                 else np.zeros((len(at), d))
             )
             own = before.own(x[at])
-            vectors = [x[at], pose.put(own), old @ (pose.R @ before.R.T).T]
-            pressure, gap = points.data[pressure_name(self.names[number])][patches.at[at]], np.zeros(len(at))
-            if place.rate:
-                gap = together(grid.comm, lambda tool=tool, own=own: tool.gap(own, grid.least))
-            scalars = [np.full(len(at), number), size[at], *stiffness[at].T, pressure, gap]
+            vectors = [x[at], pose.put(own), n[at], old @ (pose.R @ before.R.T).T]
+            pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
+            gaps = [together(grid.comm, partial(tool.gap, y, grid.least)) for y in (own, pose.own(x[at]))]
+            scalars = [np.full(len(at), number), size[at], *stiffness[at].T, pressure, *gaps]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
-        number, *own, gap = sent[:, :6].T
-        now, carried, shear = np.split(sent[:, 6:], 3, axis=1)
-        acts = np.ones(len(number)), self.tools, poses, now, carried, gap
+        number, *own, start_gap, side_gap = sent[:, :7].T
+        now, carried, side, shear = np.split(sent[:, 7:], 4, axis=1)
+        acts = np.ones(len(number)), self.tools, poses, now, carried, start_gap, side_gap, side
         pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         return ContactLaw(self.names, self.tools, pairs), origin
+
+    def _normals(self, tool: Tool, pose: Pose, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the outward unit normals (m, d) of a tool at positions x (m, d)."""
+        n = together(self.grid.comm, lambda: tool.solid(self.grid.least).normal(pose.own(x)) @ pose.R.T)
+        return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), TINY)
 
     def _cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return positions divided by the cell size."""
@@ -248,9 +252,8 @@ class Tools(Touching):
         edge = np.zeros(len(y), dtype=bool)
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
-                shifted = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = together(grid.comm, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
-                edge |= np.einsum("md,md->m", n, to) >= -FACING
+                shifted = y + half * (e - n[:, [axis]] * n)
+                edge |= np.einsum("md,md->m", n, self._normals(tool, pose, shifted)) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
         cells = self._cells
