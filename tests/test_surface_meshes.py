@@ -362,7 +362,8 @@ def test_a_free_tool_falls_and_turns_as_the_hull_of_its_corners():
         s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], conditions=[tool], **options)
         s.run(0.1, 0.005, progress=False)
         found.append([*s.outcome("tool_travel").array[0], s.outcome("tool_rotation").array[0]])
-    assert found[1] == pytest.approx(found[0], rel=1e-5) and found[0][1] < -0.02
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
+    assert found[0][1] < -0.01  # the lowest corner has reached the soil
 
 
 def test_facets_are_drawn():

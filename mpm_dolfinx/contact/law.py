@@ -46,17 +46,17 @@ from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
 """The stiffness k is this factor times the modulus `Pairs.resistance`, divided by the cell size.  Sensitivity (scene
-"contact" of tests/plateaus.py): half this value changes the result by 1.9e-03, and twice this value by 3.2e-03.  Finer
+"contact" of tests/plateaus.py): half this value changes the result by 1.9e-03, and twice this value by 1.3e-03.  Finer
 cells change it by 1.1e-02.  With inertia, `rho h^2 / (GAMMA dt)^2` is added to the modulus.
 """
 GRIP = 6.0
 """The stiffness k_t is this factor times the modulus `Pairs.resistance`, divided by the cell size.  Sensitivity (scene
-"contact" of tests/plateaus.py): half this value changes the result by 3.6e-03, and twice this value by 2.6e-03.  Finer
+"contact" of tests/plateaus.py): half this value changes the result by 3.6e-03, and twice this value by 1.9e-03.  Finer
 cells change it by 1.1e-02.
 """
 DEPTH = 5e-4
 """Allowed mean penetration in a cell, divided by the cell size.  Sensitivity (scene "contact" of tests/plateaus.py):
-half this value changes the result by 2.6e-03, and twice this value by 2.4e-03.  Finer cells change it by 1.1e-02.
+half this value changes the result by 2.5e-03, and twice this value by 2.6e-03.  Finer cells change it by 1.1e-02.
 """
 ROUNDS = int(-np.log2(DEPTH * DEPTH))
 """Largest number of augmentations, and largest number of updates of the contact pairs, in a substep."""

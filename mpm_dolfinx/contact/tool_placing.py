@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from functools import partial
 from typing import NamedTuple
@@ -32,9 +32,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 NEAR = 0.1
 """Distance from a tool, in cell sizes, below which Q1 displacements of domain corners get no correction.
-Sensitivity (scene "tool" of tests/plateaus.py): half this value changes the result by 4.1e-03, and twice this value by
-1.5e-03. Finer cells change it by 7.1e-02."""
-FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
+Sensitivity (scene "tool" of tests/plateaus.py): half this value changes the result by 3.8e-03, and twice this value by
+1.4e-03. Finer cells change it by 6.3e-02."""
+FACING = 0.5  # smallest cosine of the angle between two normals that have the same direction, or opposite directions
+HALVINGS = int(-np.log2(DEPTH))  # number of bisections that locate the edge of a tool to `DEPTH` cell sizes
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
@@ -57,6 +58,21 @@ def _outwards(tool: Tool, y: NDArray[np.float64], depth: NDArray[np.float64], h:
     mean = np.stack([(ahead - behind) / 2 for ahead, behind in ends], axis=1)
     varies = np.abs(mean - out).max(axis=1, keepdims=True, initial=0.0) > SAME * h
     return np.where(varies, mean, out)
+
+
+Normals = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Function that returns the outward unit normals (k, d) of a tool at positions (k, d)."""
+
+
+class Below(NamedTuple):
+    """Patches of surfaces (m,), and the patches (k,) among them that face a tool."""
+
+    x: NDArray[np.float64]  # positions (m, d), m
+    unit: NDArray[np.float64]  # outward unit normals of the bodies (m, d)
+    rows: NDArray[np.int64]  # indices of the patches that face the tool (k,)
+    on: NDArray[np.float64]  # positions from which distances to edges are measured (k, d), m: in 2D on the tool
+    out: NDArray[np.float64]  # outward unit normals of the tool there (k, d); in 3D opposite to the normals of bodies
+    extent: NDArray[np.float64]  # distances to the ends of the patches (k,), m; in 3D, 0, as patches are not divided
 
 
 class LoadMotion(NamedTuple):
@@ -202,29 +218,42 @@ class Tools(Touching):
         patches = cut.contact_surface(self.outside)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
+        unit, around = area / np.maximum(size, TINY)[:, None], np.broadcast_to(grid.around(x), size.shape)
         stiffness = self._stiffness(cut.points)[patches.at] * [1.0, place.rate]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = self._normals(tool, pose, x)
-            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
-            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
+            at = np.flatnonzero(free & (np.einsum("md,md->m", unit, n) < -FACING))
+            gap = together(grid.comm, partial(tool.gap, pose.own(x[at]), grid.least))
+            below = Below(x, unit, at, x[at], -unit[at], np.zeros(len(at)))
+            if d == 2:  # patches are Gauss points: distance to the nearer end of a face, on the tool
+                extent = (1 - 3**-0.5) * size[at] / np.maximum(around[at], TINY)
+                extent = np.maximum(TINY, extent * np.abs((unit * n).sum(axis=1)[at]))
+                below = below._replace(on=x[at] - gap[:, None] * n[at], out=n[at], extent=extent)
+            share, shift = self._covered(partial(self._normals, tool, pose), below)
+            kept = share > SAME
+            at, gap = at[kept], gap[kept]
+            share, shift = share[kept], shift[kept]
+            shift -= np.einsum("md,md->m", shift, unit[at])[:, None] * unit[at]  # along the surface of the body
+            now, gap = x[at] + shift, gap + np.einsum("md,md->m", shift, n[at])
+            share = share * grid.around(now) / np.maximum(around[at], TINY)
             old = (
                 points.data[shear_name(self.names[number])][patches.at[at]]
                 if tool.frictional
                 else np.zeros((len(at), d))
             )
-            own = before.own(x[at])
-            vectors = [x[at], pose.put(own), n[at], old @ (pose.R @ before.R.T).T]
+            own = before.own(now)
+            vectors = [patches.x[at] + shift, now, pose.put(own), n[at], old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
-            gaps = [together(grid.comm, partial(tool.gap, y, grid.least)) for y in (own, pose.own(x[at]))]
-            scalars = [np.full(len(at), number), size[at], *stiffness[at].T, pressure, *gaps]
+            gaps = [together(grid.comm, partial(tool.gap, own, grid.least)), gap]
+            scalars = [np.full(len(at), number), share * size[at], *stiffness[at].T, pressure, *gaps]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
-        cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        cell, sent = exchange.send(patches.cell[at]), exchange.send(values)
         number, *own, start_gap, side_gap = sent[:, :7].T
-        now, carried, side, shear = np.split(sent[:, 7:], 4, axis=1)
+        places, now, carried, side, shear = np.split(sent[:, 7:], 5, axis=1)
         acts = np.ones(len(number)), self.tools, poses, now, carried, start_gap, side_gap, side
         pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
@@ -239,35 +268,64 @@ class Tools(Touching):
         """Return positions divided by the cell size."""
         return x / self.grid.h if self.grid.even else self.grid.in_cells(x)
 
-    def _edge(
-        self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Return which positions below a tool are within half a cell of an edge of the tool.
+    def _covered(self, normals: Normals, below: Below) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the parts of k patches below a tool on which the contact acts.
 
-        These positions have no contact, because the last loaded node also represents the half cell beyond the edge.
-        Edges at which the surface of the body ends are ignored.
+        The results are fractions of the areas (k,), and vectors (k, d), in m, from the middles of the patches to the
+        middles of these parts.  The last loaded node also represents half a cell beyond an edge of the tool.  Half a
+        cell inside the edge therefore has no contact.  Edges beyond which the surface of the body ends are ignored.
+        If no patch is left whole, as below a tool narrower than a cell, the contact acts on all patches.
         """
-        grid, (y, n) = self.grid, (x[faces], unit[faces])
-        h = grid.sizes_at(y)
-        edge = np.zeros(len(y), dtype=bool)
-        for axis, e in enumerate(np.eye(grid.dim)):
-            for half in (-0.5 * h, 0.5 * h):
-                shifted = y + half * (e - n[:, [axis]] * n)
-                edge |= np.einsum("md,md->m", n, self._normals(tool, pose, shifted)) >= -FACING
-        if not over_all(grid.comm, int(edge.sum())):
-            return edge
-        cells = self._cells
-        low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
-        off = ~faces & (np.abs(np.clip(cells(x), low, high) - cells(x)) <= 1).all(axis=1)
-        beyond = np.concatenate(grid.comm.allgather(np.hstack([cells(x[off]), unit[off]])))
-        pairs = cKDTree(cells(y[edge])).sparse_distance_matrix(
-            cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray"
-        )
-        on = np.einsum("md,md->m", n[edge][pairs["i"]], beyond[pairs["j"], grid.dim :]) > np.sqrt(0.5)
-        goes_on = np.zeros(int(edge.sum()), dtype=bool)
-        goes_on[pairs["i"][on]] = True
-        edge[edge] = goes_on
-        return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
+        units, ends = self._ends(normals, below)
+        share, shift = np.ones(len(below.rows)), np.zeros_like(below.on)
+        edge = (ends < below.extent).any(axis=0)
+        if not over_all(self.grid.comm, int(edge.sum())):
+            return share, shift
+        edge[edge] = self._goes_on(below, below.rows[edge])
+        share[edge] = 0.0
+        if self.grid.dim == 2:
+            share[edge] = np.clip(ends[:, edge].sum(axis=0) / (2 * below.extent[edge]), 0.0, 1.0)
+            part = edge & (share > 0)
+            shift[part] = ((ends[1] - ends[0])[:, None] / 2 * units[1])[part]
+        whole = over_all(self.grid.comm, int((share == 1).sum()))
+        return (share, shift) if whole else (np.ones_like(share), np.zeros_like(shift))
+
+    def _ends(self, normals: Normals, below: Below) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return opposite unit tangents (2 a, k, d) at k positions below a tool, and the ends of the contact (2 a, k).
+
+        The tangents are projections of a edges of a cell: in 2D of the edge with the smallest angle to the tangent
+        plane.  The ends are distances along the tangents, in m, at most `extent`, and negative outside of the contact.
+        """
+        on, out = below.on, below.out
+        flat = self.grid.dim == 2
+        axes = np.eye(self.grid.dim)[np.abs(out).argsort(axis=1, kind="stable")[:, : 1 if flat else None].T]
+        half = axes - np.einsum("jkd,kd->jk", axes, out)[:, :, None] * out
+        half *= (axes * self.grid.sizes_at(on)).sum(axis=2, keepdims=True) / 2
+        half = np.concatenate([-half, half])
+        length = np.linalg.norm(half, axis=2)
+        units, far = half / np.maximum(length, TINY)[:, :, None], length + below.extent
+        ahead = normals((on + far[:, :, None] * units).reshape(-1, self.grid.dim)).reshape(units.shape)
+        at = np.nonzero(np.einsum("jkd,kd->jk", ahead, out) <= FACING)
+        span, turn = np.stack([np.zeros(len(at[0])), far[at]]), ahead[at] - out[at[1]]
+        for _ in range(HALVINGS if flat and over_all(self.grid.comm, len(turn)) else 0):
+            middle = span.mean(axis=0)
+            beyond = np.einsum("kd,kd->k", turn, normals(on[at[1]] + middle[:, None] * units[at])) > 0
+            span[beyond.astype(int), np.arange(len(middle))] = middle
+        ends = np.broadcast_to(below.extent, far.shape).copy()
+        ends[at] = span.mean(axis=0) - length[at]
+        return units, ends
+
+    def _goes_on(self, below: Below, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether the surface of a body goes on beyond the tool within one cell of the patches `rows` (k,)."""
+        grid, unit = self.grid, below.unit
+        cells = self._cells(below.x)
+        low, high = (over_all(grid.comm, end, op) for end, op in _box(cells[rows]))
+        off = (np.abs(np.clip(cells, low, high) - cells) <= 1).all(axis=1)
+        off[below.rows] = False
+        beyond = np.concatenate(grid.comm.allgather(np.hstack([cells[off], unit[off]])))
+        near = cKDTree(cells[rows]).sparse_distance_matrix(cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray")
+        same = np.einsum("md,md->m", unit[rows[near["i"]]], beyond[near["j"], grid.dim :]) > FACING
+        return np.isin(np.arange(len(rows)), near["i"][same])
 
     def _warn_light(self, place: Place) -> None:
         """Warn of free tools whose mass is less than the mass of soil in half a cell."""
