@@ -6,7 +6,8 @@ mean.  A stiff penalty at each point would lock sides that are curved or incline
 start of the step is applied as a load, so the penalties carry only the increment of the traction.
 
 With inertia, a second penalty acts on the displacement increment of the step.  Its modulus is rho (h / (gamma dt))^2,
-with the density rho, the cell size h and `GAMMA`.  This penalty prevents a lag of the side in short steps.
+with the density rho, the cell size h and `GAMMA`.  This penalty prevents a lag of the side in short steps.  An earlier
+lag, and its slope along the side, do not enter this penalty.
 """
 
 from __future__ import annotations
@@ -141,8 +142,10 @@ class HeldCells:
         off = p.x - x[at]
         cell = key % grid.num_local
         given, spread = mean(p.given), (mean(off**2) + NEAR * grid.sizes(cell) ** 2)[:, :, None]
-        slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in ((p.gap, gap), (p.given, given)))
-        slope, rise = slopes
+        step = mean(p.step)
+        pairs = (p.gap, gap), (p.given, given), (p.step, step)
+        slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in pairs)
+        slope, rise, turn = (both(of, of[at]) for of in slopes)
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
         self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
         self.x, self.shape = both(x, p.x), both(mean(N), N)
@@ -167,9 +170,10 @@ class HeldCells:
         self.limit = short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         if inert.any():  # a gap at the start causes no velocity
-            self._gap = self.static * self._gap + (1 - self.static) * both(mean(p.step), p.step)
-        self._slope, self._along = both(slope, slope[at]), both(along, along[at])
-        self._given, self._rise = both(given, given[at]), both(rise, rise[at])
+            self._gap = self.static * self._gap + (1 - self.static) * both(step, p.step)
+            slope = self.static[:, None] * slope + (1 - self.static[:, None]) * turn
+        self._slope, self._along = slope, both(along, along[at])
+        self._given, self._rise = both(given, given[at]), rise
         self._x = both(x, x[at])
         self.path = np.diff(self._given.reshape(-1, 2, grid.dim), axis=1)[:, 0]
 
