@@ -128,6 +128,7 @@ class At(NamedTuple):
     unknowns: Unknowns  # numbering of the unknowns in u
     u: NDArray[np.float64]  # nodal displacement increments (dofs,), m
     parts: Parts | None = None  # connected parts of the bodies
+    held: NDArray[np.float64] | None = None  # forces `State.held` (dofs,), N; None without them
 
     @property
     def nodal(self) -> NDArray[np.float64]:

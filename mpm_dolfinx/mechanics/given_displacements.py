@@ -28,6 +28,7 @@ from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by, sums_of_rows
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, rotated
@@ -86,6 +87,11 @@ class GivenDisplacements(Acting):
         for hold in displacements.values():
             if not callable(hold.value):  # values of functions are checked when they are called
                 hold.at(0.0, np.empty((1, d)))
+
+    @property
+    def space(self) -> fem.FunctionSpace:
+        """Function space of the nodal displacements."""
+        return self._forms.u.function_space
 
     @property
     def surfaces(self) -> list[Surface]:
@@ -213,7 +219,8 @@ class GivenDisplacements(Acting):
         for number, x in held.beyond(loads.row, axis, force, loads.reached(at), reported):
             why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
             self._warn(number, ARTEFACT, x + self._grid.base, why)
-        number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
+        number, force = held.number[loads.row], loads.share.sum(axis=1) * force + loads.kept_at_rest(at)
+        force = force[:, None] * data["direction"]
         sums = self._grid.comm.allreduce(sums_of_rows(number, force, len(self._holds)))
         return dict(zip(self._names, sums, strict=True))
 
@@ -317,6 +324,12 @@ class HoldLoads(Loads):
         self.data = self.data.having(gap=self.data["gap"][:, 0] + gap * more[side])
         return bool(more.any())
 
+    @property
+    def _dofs(self) -> NDArray[np.int64]:
+        """Local dofs (k, 2^d) of the nodes of each component."""
+        axis = self.data["direction"].argmax(axis=1)
+        return self._d * self.data.points.grid.cell_nodes[self.data.cells] + axis[:, None]
+
     def reached(self, at: At) -> NDArray[np.bool_]:
         """Return whether each component has reached its prescribed value, within `1 / sqrt(HOLD)` of its increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
@@ -351,12 +364,26 @@ class HoldLoads(Loads):
         """Return the power of the penalty forces, in W."""
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
+    def kept_at_rest(self, at: At) -> NDArray[np.float64] | float:
+        """Return the part of the forces `At.held` that belongs to each component, in N.
+
+        These forces cancel penalty forces of bodies at rest, for instance of a lag after one static step.  Components
+        that act on the same node share its force in proportion to their stiffness.
+        """
+        if at.held is None:
+            return 0.0
+        dofs = self._dofs
+        weight = self.share * self.data["stiffness"][:, :1]
+        total = fem.Function(self._acting.space)
+        np.add.at(total.x.array, dofs, weight)
+        sum_ghosts(total)
+        total.x.scatter_forward()
+        whole = total.x.array[dofs]
+        return (np.divide(weight, whole, out=np.zeros_like(weight), where=whole > 0) * at.held[dofs]).sum(axis=1)
+
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return local dofs and their penalty forces, which are not reactions of walls, see `Loads.counted`."""
-        dofs = (
-            self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
-        )
-        return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
+        return self._dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return an initial guess of the nodal displacements, or None if no connected part rotates.

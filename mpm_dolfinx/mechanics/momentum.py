@@ -420,6 +420,7 @@ class MomentumProblem:
         self.yielded = yielded
         self.loads = tuple(loads)
         self._goes_on = goes_on
+        self._held = held
         self._tolerance = tolerance
         names = "dead", "loads", "resists", "takes_up", "pulls", "push", "inertia", "settle", "augment", "follow"
         self._own = defined(loads, *names)
@@ -440,7 +441,7 @@ class MomentumProblem:
     @cached_property
     def at(self) -> At:
         """The present displacements."""
-        return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
+        return At(self.system.unknowns, self.forms.u.x.array, self.system.parts, self._held)
 
     def settle(self, sticks: bool) -> bool:
         """Update stick and slip in contacts, and return whether any changed.  `sticks` allows slip to become stick."""
