@@ -20,16 +20,16 @@ SAMPLES = 64
 class Stepwise:
     """Piecewise constant function of time, such as recorded rates of rain, for values of conditions and for gravity.
 
-    The value `values[k]` begins at `times[k]`, and remains until `times[k + 1]`.  The last value has no end.  Steps end
-    at all `times`, so the volumes of rain and inflow are exact to rounding.  Results at `times[k]` belong to the value
-    before `times[k]`.
+    The value `values[k]` begins after `times[k]`, and remains until `times[k + 1]`.  The value at `times[0]` is
+    `values[0]`, and the last value has no end.  Steps end at all `times`, so volumes of rain and inflow are exact to
+    rounding.  Results at `times[k]`, and factors of safety at this time, belong to the value before `times[k]`.
 
     Parameters
     ----------
     times : (n,), s
         Increasing times at which the values begin.
     values : (n,) or (n, d)
-        Values in the unit of the condition.
+        Values in the unit of the condition.  With inertia, the displacement of a side or a tool must not jump.
 
     Raises
     ------
@@ -46,34 +46,49 @@ class Stepwise:
         if self.values.ndim not in (1, 2) or len(self.values) != len(self.times):
             what = f"Stepwise: values of shape {self.values.shape}"
             raise ValueError(f"{what}, must be one value, or a row of components, for each of {len(self.times)} times")
+        size = np.abs(self.times)
+        # a step that ends at a time may end at another number, because of rounding
+        self._ends = self.times + ROUND_OFF * np.maximum(size, np.append(0.0, size[:-1]))
+        self._first = self.times[0] - ROUND_OFF * size[0]
+
+    def __repr__(self) -> str:
+        """Return the call of the constructor, for messages."""
+        return f"Stepwise({line(self.times.tolist())}, {line(self.values.tolist())})"
 
     def __call__(self, t: float) -> NDArray[np.float64]:
         """Return the value () or (d,) at time t (s)."""
-        if t < self.times[0]:
+        if t < self._first:
             raise ValueError(f"Stepwise: t = {t:g} s, must not be before the first time, {self.times[0]:g} s")
-        return self.values[np.searchsorted(self.times, t, side="right") - 1]
+        return self.values[max(0, np.searchsorted(self._ends, t) - 1)]
+
+
+def stepwise(condition: Any) -> dict[str, Stepwise]:
+    """Return the `Stepwise` values of a condition by the name of the attribute, for example of a water level."""
+    own = getattr(condition, "__dict__", {})
+    values = {name: getattr(value, "level", value) for name, value in own.items()}
+    return {name: value for name, value in values.items() if isinstance(value, Stepwise)}
 
 
 def functions_of_time(conditions: Iterable[Any], gravity: Any) -> list[Stepwise | Callable[[float], NDArray]]:
     """Return the functions at whose jumps steps end: each `Stepwise`, and each flux that depends on time alone."""
-    out = [gravity] if isinstance(gravity, Stepwise) else []
+    out: list[Stepwise | Callable[[float], NDArray]] = [gravity] if isinstance(gravity, Stepwise) else []
     for one in conditions:
-        for value in (getattr(one, name) for name in getattr(one, "FUNCTIONS", ())):
-            if isinstance(value, Stepwise):
-                out.append(value)
-            elif isinstance(one, Flux) and callable(value) and takes(value) == ("t",):
-                out.append(one.at)
+        out += stepwise(one).values()
+        if isinstance(one, Flux) and callable(one.flux) and not isinstance(one.flux, Stepwise):
+            out += [one.at] if takes(one.flux) == ("t",) else []
     return out
 
 
 def before_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], start: float, end: float) -> float:
-    """Return `end`, or a time just before the first jump of a function in the step from `start` to `end`, in s."""
-    near = ROUND_OFF * max(abs(start), abs(end))  # the step ends before the jump, even if its end is rounded
+    """Return `end`, or the time of the first jump of a function in the step from `start` to `end`, in s.
+
+    The result is just before the jump of a function that is not `Stepwise`.
+    """
+    near = ROUND_OFF * max(abs(start), abs(end))
     for function in functions:
         if isinstance(function, Stepwise):
             later = function.times[function.times > start + near]
-            if len(later) and later[0] <= end + near:
-                end = min(end, later[0] - near / 4)
+            end = min([end, *later[:1]])
             continue
         while end - start > 2 * near and (jump := _jump(function, start + near, end, near / 4)) is not None:
             end = jump

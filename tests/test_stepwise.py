@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: MIT
+"""Values that jump in time: every place takes `Stepwise`, and steps of any length give the same results."""
+
+import pytest
+
+import mpm_dolfinx as mpm
+
+SOIL = {"bulk": 4e6, "shear": 2e6, "porosity": 0.4}
+JUMP = 2.5  # s
+
+
+def steps(low, high, at=JUMP):
+    """Return a value that jumps at the time `at`."""
+    return mpm.Stepwise([0, at], [low, high])
+
+
+def block(conditions=(), conductivity=1e-4, **options):
+    """Return a block, 2 m wide and 2 m high, between smooth walls on a rough base."""
+    grid = mpm.Grid([0, 0], [2, 3], [4, 6])
+    options = {"walls": {"bottom": "xy", "left": "x", "right": "x"}, **options}
+    soil = mpm.Hencky(**SOIL, conductivity=conductivity)
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 2])], [soil], conditions=conditions, **options)
+
+
+def plate(**motion):
+    """Return a plate of soil's width, as a tool on top of the block."""
+    return mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), name="plate", **motion)
+
+
+WET, HEAVY = {"fluid": mpm.Fluid(gravity=9.81)}, {"gravity": (0, -9.81)}
+PLACES = {
+    "traction": lambda: block([mpm.Traction("top", steps(0, -1e3))]),
+    "vector": lambda: block([mpm.Traction("top", steps((0, 0), (0, -1e3)))]),
+    "pressure": lambda: block([mpm.Pressure("top", steps(0, 1e3))]),
+    "plate": lambda: block([mpm.RigidPlate("top", steps(0, 1e3))]),
+    "displacement": lambda: block([mpm.Displacement("top", steps((0, 0), (0, -1e-3)), "y")]),
+    "tool": lambda: block([plate(displacement=steps((0, 0), (0, -1e-3)))]),
+    "load": lambda: block([plate(load=steps(10, 1e3), direction=(0, -1))]),
+    "gravity": lambda: block(gravity=steps((0, 0), (0, -9.81))),
+    "drained": lambda: block([mpm.Drained("top", steps(0, 1e3))], **WET),
+    "inflow": lambda: block([mpm.Inflow("top", steps(0, 1e-6))], **WET),
+    "rain": lambda: block([mpm.Rain("top", steps(0, 1e-6))], **WET),
+    "level": lambda: block(mpm.water("top", steps(2, 2.2)), **WET, **HEAVY),
+    "wave": lambda: block([mpm.Quiet("bottom", steps((0, 0), (1e-6, 0)))], walls={"left": "xy"}, inertia=True),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_step_ends_at_the_jump_wherever_the_value_stands(place):
+    """Earlier, jumps of water levels, and of the motion and the load of tools, were within a step."""
+    s = PLACES[place]()
+    s.run(2.0, 2.0, t_eval=[0.01, 2.0], progress=False)
+    taken = []
+    while s.t < 4.4:
+        taken.append(s.state.stage.without_jump(s.t, 1.0))
+        s.step(taken[-1])
+    assert taken == pytest.approx([0.5, 1.0, 1.0], rel=1e-12)
+
+
+@pytest.mark.parametrize("dt", [1.0, 3.0])
+def test_a_tool_that_jumps_at_an_output_drags_the_soil_with_its_whole_friction(dt):
+    """Earlier, a step from the time of the jump did not see the motion: friction was 5 % too small."""
+    ways = (0, 0), (0, -2e-3), (1e-3, -2e-3)
+    s = block([plate(displacement=mpm.Stepwise([0, 1, 2], ways), friction=0.3)])
+    s.run(3.0, dt, progress=False)
+    shear, normal = s.tool_forces["plate"][:2]
+    assert shear == pytest.approx(-0.3 * normal, rel=1e-6)
+
+
+def test_times_hold_up_to_rounding():
+    """A time that steps have added up may differ from the time of a table by rounding errors."""
+    table = mpm.Stepwise([0.8, 1.2, 2.0], [1.0, 2.0, 3.0])
+    early, late = sum([0.1] * 8), 3 * 0.4
+    assert early < 0.8 and late > 1.2
+    assert [float(table(t)) for t in (early, 0.8, late, 1.2 + 1e-9, 2.0, 2.1)] == [1, 1, 1, 2, 2, 3]
+    with pytest.raises(ValueError, match=r"Stepwise: t = 0\.79 s, must not be before the first time, 0\.8 s"):
+        table(0.79)
+    s = block()
+    s.run(early, 0.1, progress=False)
+    s.stage(conditions=[mpm.Traction("top", mpm.Stepwise([0.8], [-1e3]))])
+    s.run(1.0, 0.1, progress=False)
+    assert s.points.displacement[:, 1].min() < -1e-4
+
+
+@pytest.mark.parametrize("make", ["displacement", "tool"])
+def test_a_displacement_that_jumps_is_refused_with_inertia(make):
+    """Earlier, impulses depended on whether the jump was at the start of a step."""
+    late = [mpm.Displacement("top", mpm.Stepwise([0, 1], [(0, 0), (0, -1e-3)]), "y")]
+    if make == "tool":
+        late = [plate(displacement=mpm.Stepwise([0, 1], [(0, 0), (0, -1e-3)]))]
+    with pytest.raises(ValueError, match=r"Stepwise\(\[0.0, 1.0\], .* jumps, must be continuous with inertia"):
+        block(late, inertia=True)
+    s = block(late, inertia=False)
+    with pytest.raises(ValueError, match="jumps, must be continuous with inertia"):
+        s.stage(inertia=True)
+    s.run(2.0, 1.0, progress=False)
+    s.stage(inertia=True)  # all jumps are over
+    s.step(1e-4)
