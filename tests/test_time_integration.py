@@ -424,8 +424,9 @@ def test_steps_whose_growth_fails_again_and_again_wait_longer_and_longer():
 def test_what_is_as_sudden_in_every_step_is_no_jump_of_the_loads():
     rule, found = StepSize(1.0, 1.0), StepControl(change=[100.0])
     report = Report(first=np.array([10.0]), sudden=np.array([10.0]))
-    assert rule.refused(1.0, report, found) == 0.5 and rule.next(0.5, report, replace(found, small=0.5), False) == 0.5
+    assert rule.refused(1.0, report, found, 1.0) == 0.5
+    assert rule.next(0.5, report, replace(found, small=0.5), False) == 0.5
     again = replace(found, first=[10.0], small=0.5)  # Pa/s, in the step before
-    assert rule.refused(1.0, report, again) == 1.0
+    assert rule.refused(1.0, report, again, 1.0) == 1.0
     assert rule.next(0.5, replace(report, sudden=np.array([5.0])), again, False) == 1.0
-    assert rule.refused(1.0, replace(report, sudden=np.array([21.0])), again) == 0.5
+    assert rule.refused(1.0, replace(report, sudden=np.array([21.0])), again, 1.0) == 0.5

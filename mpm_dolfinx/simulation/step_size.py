@@ -145,10 +145,21 @@ class StepSize:
         # steps that fit up to rounding have equal lengths
         return left if not left > (1 - SAME) * small else small
 
-    def refused(self, size: float, report: Report, control: StepControl) -> float:
-        """Return the factor by which a computed step must be shortened, or 1 if the step is accepted."""
+    def whole(self, first: float, small: float) -> float:
+        """Return the length of a step that the test of overshoots may halve.
+
+        `first`, in s: first trial length of the step.  It is shorter than the present length of the steps, `small`, if
+        the step ends at an output or at a jump of the loads.
+        """
+        return first if first < (1 - SAME) * min(small, self.longest) else self.longest
+
+    def refused(self, size: float, report: Report, control: StepControl, whole: float) -> float:
+        """Return the factor by which a computed step must be shortened, or 1 if the step is accepted.
+
+        `whole`: see the method of this name.
+        """
         if not self.by_error:
-            return 0.5 if size > 0.75 * self.longest and self._rings(size, report, control) else 1.0
+            return 0.5 if size > 0.75 * whole and self._rings(size, report, control) else 1.0
         # most rejected steps are at jumps or kinks of the loads, where the error is of first order
         return 1.0 if self._excess(size, report, control) <= 1 else self._factor(size, report, control, 1.0)
 

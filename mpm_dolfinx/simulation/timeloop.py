@@ -301,7 +301,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
     The step is shortened until it converges and its errors are within the tolerances.
     """
     comm = simulation.scene.grid.comm
-    preferred = whole = None
+    preferred = whole = halved = None
     cause: StepFailed | None = None
     while True:
         state = simulation.state
@@ -310,12 +310,13 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         size, how = rule.fitted(target - state.t, control.small), ()
         size = simulation.without_jump(size)
         preferred, whole = preferred or rule.preferred(size), whole or size
+        halved = halved or rule.whole(size, control.small)
         try:
             new, report = simulation.advanced(size)
         except StepFailed as failed:
             cause = cause if isinstance(cause, CannotFollow) else failed  # its message is clearer than later ones
             cut, counted = rule.cut(size, control), replace(result, cuts=result.cuts + 1)
-            left = _has_left(failed, rule, size, state)
+            left = _has_left(failed, rule, size, state, halved)
             if not left and cut.small >= rule.least(preferred, state.t):
                 _note(simulation, counted, cut)
                 verbose_step = verbose and not result.cuts
@@ -329,7 +330,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
             how = (EULER,)
             (new, report) = found
         now = measured(control, report)
-        if (shrinks := rule.refused(size, report, now)) < 1:
+        if (shrinks := rule.refused(size, report, now, halved)) < 1:
             small = preferred = size * shrinks
             if state.t + small == state.t:
                 why = f"gave up at t = {state.t:g} s: no step is short enough for rtol = {rule.rtol:g}"
@@ -359,11 +360,11 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     return found
 
 
-def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
+def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State, whole: float) -> bool:
     """Return whether points leave the grid in a step whose errors are within the tolerances."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
-    return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1
+    return rule.refused(size, failed.report, measured(state.control, failed.report), whole) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
