@@ -129,3 +129,47 @@ def test_points_in_few_cells_have_the_slope_of_water_at_rest(cells, drained):
     s.run(1e5, 2e4, progress=False)
     off = s.points.pressure + 9810 * s.points.x[:, 1]
     assert np.ptp(off) < 0.1 and np.ptp(s.points.pressure) > 2000
+
+
+@pytest.mark.parametrize("shape", [(5, 4), (4, 3, 5)], ids=["2D", "3D"])
+@pytest.mark.parametrize("filled", [1.0, 0.3, 0.01])
+def test_a_linear_head_aslant_is_exact_in_unsaturated_soil_too(shape, filled):
+    grid, reconstruction, centroid, faces = cells(shape, filled)
+    slope, pull, n = np.array([3.0, -2.0, 5.0])[: grid.dim], np.array([-1.0, 0.5, -9.0])[: grid.dim], grid.num_owned
+    slot = np.repeat(np.arange(n), 7)
+    x = centroid[slot] + 0.3 * grid.h * RANDOM.uniform(-1, 1, (len(slot), grid.dim))
+    head = CellPressures(np.arange(n), (grid.midpoints + centroid) @ slope, centroid, faces, outer(grid))
+    for alike in (True, RANDOM.random((n, grid.dim, 2)) < 0.5):
+        found = reconstruction.up_to_surface(head, x, slot, lambda of, x: x @ pull, alike)
+        assert found == pytest.approx((grid.midpoints[slot] + x) @ (slope + pull), abs=1e-12)
+
+
+@pytest.mark.parametrize("axisymmetric", [False, True])
+def test_points_at_a_wetting_front_pass_no_neighbour(axisymmetric):
+    """Earlier, only heads were limited: nearly uniform pressures above the front zigzagged by 600 Pa."""
+    grid = mpm.Grid([0, 0], [1.0, 4.5], [2, 9], axisymmetric=axisymmetric)
+    law = mpm.VanGenuchten(4905.0, residual=0.08, n=2.2)
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, conductivity=1e-5, retention=law)
+    scene = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "gravity": (0, -9.81), "fluid": mpm.Fluid()}
+    scene |= {"pressure": mpm.hydrostatic(-2.0), "initial_stress": mpm.K0(0.5)}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 4])], [soil], conditions=[mpm.Rain("top", 5.556e-6)], **scene)
+    s.run(8e4, 1e4, progress=False)
+    wet = s.points.x[:, 1] > 2.5
+    p = s.points.pressure[wet][np.argsort(s.points.x[wet, 1], kind="stable")]
+    assert (np.diff(p) > -1e-3).all()
+    cells = s.cells()
+    for x, mean in zip(cells.x, cells.pressure, strict=True):
+        inside = (np.abs(s.points.x - x) <= 0.26).all(axis=1)
+        assert s.points.pressure[inside].mean() == pytest.approx(mean, rel=2e-2)
+
+
+@pytest.mark.parametrize("level", [-1.0, 0.7])
+def test_unsaturated_water_at_rest_is_hydrostatic_next_to_drained_sides(level):
+    grid = mpm.Grid([0, 0], [1.0, 2.5], [2, 5])
+    soil = mpm.Hencky(bulk=1e9, shear=5e8, conductivity=1e-5, retention=mpm.VanGenuchten(4905.0, n=2.2))
+    sides = [mpm.Drained("bottom", 9810.0 * level), mpm.Drained("top", 9810.0 * (level - 2))]
+    scene = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "gravity": (0, -9.81), "fluid": mpm.Fluid()}
+    scene |= {"pressure": mpm.hydrostatic(level), "initial_stress": mpm.K0(0.5)}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 2])], [soil], conditions=sides, **scene)
+    s.step(1e3)
+    assert s.points.pressure == pytest.approx(9810 * (level - s.points.x[:, 1]), abs=1.0)

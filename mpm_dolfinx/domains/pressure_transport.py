@@ -27,6 +27,9 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import Pieces
 from mpm_dolfinx.points.material_points import MaterialPoints
 
+AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
+"""Function of local cells (n,) and positions (n, d), in m, in these cells. The function returns values (n,)."""
+
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
@@ -153,7 +156,12 @@ class Reconstruction:
         return jump, one_sided, is_open, drained
 
     def up_to_surface(
-        self, pressures: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
+        self,
+        pressures: CellPressures,
+        x: NDArray[np.float64],
+        slot: NDArray[np.int64],
+        at_rest: AtPlaces | None = None,
+        alike: NDArray[np.bool_] | bool = True,
     ) -> NDArray[np.float64]:
         """Return pressures (m,), in Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
@@ -161,6 +169,9 @@ class Reconstruction:
 
         `x` (m, d), in m: positions relative to the midpoints of their cells.
         `slot` (m,): index of the cell of each position in `pressures.cells`.
+        `at_rest`: hydrostatic pressures to be added if `pressures` are heads, or None.  The sum is limited to the range
+        in the cell and its neighbours.  At sides and other soils, hydrostatic and linear continuations bound the range.
+        `alike` (n, d, 2): whether a cell and its neighbour contain the same soil alone.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, is_open, drained = self._differences(pressures)
@@ -177,7 +188,47 @@ class Reconstruction:
         low, high = _bounds_of(jump)
         low, high = low + sum_by(at, np.minimum(on, 0), len(cells)), high + sum_by(at, np.maximum(on, 0), len(cells))
         increment = np.add.reduce(slope[slot] * (x - centroid[cells[slot]]), axis=1)
-        return p[cells[slot]] + share_within(increment, low, high, slot)[slot] * increment
+        share = share_within(increment, low, high, slot)
+        head = p[cells[slot]] + share[slot] * increment
+        if at_rest is None:
+            return head
+        jump = np.where(is_open & ~alike, np.nan, jump)
+        mean, low, high = self._range(pressures, jump, (is_open, drained), share[:, None] * slope, at_rest)
+        increment = head + at_rest(cells[slot], self.grid.midpoints[cells[slot]] + x) - mean[slot]
+        return mean[slot] + share_within(increment, low, high, slot)[slot] * increment
+
+    def _range(
+        self,
+        pressures: CellPressures,
+        jump: NDArray[np.float64],
+        ends: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+        slope: NDArray[np.float64],
+        at_rest: AtPlaces,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the pressures (n,) of cells, and the smallest (<= 0) and largest difference (n,) from them, in Pa.
+
+        `jump` (n, d, 2), in Pa: differences of the heads to neighbours and drained sides; nan at other soils.
+        `ends` (n, d, 2): whether there is a neighbour, and whether there is a drained side.
+        `slope` (n, d), in Pa/m: slopes of the heads.
+        """
+        cells, p, centroid, *_ = pressures
+        is_open, drained = ends
+        place = self.grid.midpoints[cells] + centroid[cells]
+        least, most = np.zeros((2, len(cells)))
+        rest, neighbours = at_rest(cells, place), self._neighbour[cells]
+        for axis in range(self.grid.dim):
+            changes = []
+            for end in range(2):
+                face, other = place.copy(), np.where(neighbours[:, axis, end] < 0, cells, neighbours[:, axis, end])
+                face[:, axis] = self.grid.midpoints[cells, axis] + (end - 0.5) * self.grid.along(cells, axis)
+                to_side = at_rest(cells, face) - rest
+                extended = to_side + slope[:, axis] * (face - place)[:, axis]
+                hydrostatic = at_rest(other, self.grid.midpoints[other] + centroid[other]) - rest
+                across = jump[:, axis, end] + np.where(is_open[:, axis, end], hydrostatic, to_side)
+                known = (is_open | drained)[:, axis, end] & ~np.isnan(across)
+                changes += [np.where(known, across, to_side), np.where(known, across, extended)]
+            least, most = least + np.minimum(np.min(changes, axis=0), 0), most + np.maximum(np.max(changes, axis=0), 0)
+        return p[cells] + rest, least, most
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the slopes of owned cells as an array over all local cells, with ghosts."""

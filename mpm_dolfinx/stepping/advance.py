@@ -25,7 +25,7 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
 from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
 from mpm_dolfinx.domains.lattice import filtered, given, seeded
-from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
+from mpm_dolfinx.domains.pressure_transport import AtPlaces, PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.grid.grid import REACH, Grid, in_chunks, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
@@ -44,7 +44,7 @@ from mpm_dolfinx.points.material_points import (
     with_ratio,
 )
 from mpm_dolfinx.points.parts import largest_of_bodies
-from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
+from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay, Trend
 

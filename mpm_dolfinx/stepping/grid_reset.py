@@ -14,6 +14,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
@@ -22,7 +23,7 @@ from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
+from mpm_dolfinx.domains.pressure_transport import AtPlaces, CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
@@ -40,9 +41,6 @@ from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
-
-AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Function of local cells (n,) and positions (n, d), in m, in these cells. The function returns values (n,)."""
 
 
 class OnGrid(Keyed):
@@ -328,10 +326,28 @@ class OnGrid(Keyed):
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
         x, middle = self.cut.plane(self.weight)[1], self.cut.grid.midpoints[self.cut.cells]
-        pressures = reconstruction.up_to_surface(seen, x - middle, places.slots)
-        if at_rest is not None:
+        limited = (at_rest, self._alike) if self._materials.retentions is not None else ()
+        pressures = reconstruction.up_to_surface(seen, x - middle, places.slots, *limited)
+        if at_rest is not None and not limited:
             pressures = pressures + at_rest(self.cut.cells, x)
         return self.cut.to_pieces(pressures)
+
+    @cached_property
+    def _alike(self) -> NDArray[np.bool_] | bool:
+        """Whether each filled owned cell and its neighbour (n, d, 2) contain the same soil alone."""
+        if not self.layered:
+            return True
+        grid, filled = self.cut.grid, self.contents.filled
+        slot = self.contents.slot(self.cut.cells)
+        out, neighbours = True, grid.neighbours(filled)
+        for kind in self.cut.to_cells(self._materials.conducting(self.cut.points)).T:
+            first, soil = np.zeros(len(filled)), fem.Function(grid.cellwise())
+            first[slot] = kind
+            several = self.contents.total((kind != first[slot]).astype(float)) > 0
+            soil.x.array[filled] = np.where(several, np.nan, first)
+            soil.x.scatter_forward()
+            out &= soil.x.array[filled][:, None, None] == soil.x.array[neighbours]
+        return out
 
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
