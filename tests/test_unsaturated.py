@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Soil whose pores drain under suction, against exact and converged solutions."""
 
+import warnings
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -521,3 +522,18 @@ def test_very_dry_sand_beside_clay_is_ponded_and_stands_a_year(cells, times, mon
         assert result.balance < 1e-8
     assert max(counts) <= 60
     assert s.cells().pressure.min() > 0
+
+
+@pytest.mark.parametrize("air_entry", [0.0, 200.0])
+def test_a_curve_that_is_infinitely_steep_is_named_when_a_step_fails(air_entry):
+    """Rain wets loam with n = 1.3 up to zero suction. With an air entry, all steps converge."""
+    law = mpm.VanGenuchten(WATER / 3.35, residual=0.1, n=1.3, air_entry=air_entry)
+    soil = mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=1e-5, retention=law)
+    sides = [mpm.Drained("bottom", pressure=0.2 * WATER), mpm.Rain("top", 3e-5)]
+    s = column(10, [soil], mpm.hydrostatic(0.2), sides, initial_stress=mpm.K0(0.5))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = s.run(3600, 600, progress=False)
+    said = [str(w.message) for w in caught if "without air_entry" in str(w.message)]
+    assert len(said) == (result.cuts > 0) == (not air_entry)
+    assert not said or ("VanGenuchten(" in said[0] and "\n" not in said[0])

@@ -24,7 +24,8 @@ from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
 from mpm_dolfinx.dynamics.energies import drift, initial_energies
 from mpm_dolfinx.parallel.exchange import by_user
-from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, log, logger, warn
+from mpm_dolfinx.pores.retention import VanGenuchten
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
 from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step, check_alike
@@ -316,6 +317,8 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         except StepFailed as failed:
             cause = cause if isinstance(cause, CannotFollow) else failed  # its message is clearer than later ones
             cut, counted = rule.cut(size, control), replace(result, cuts=result.cuts + 1)
+            if not result.cuts:
+                _warn_steep(simulation.scene, failed)
             left = _has_left(failed, rule, size, state, halved)
             if not left and cut.small >= rule.least(preferred, state.t):
                 _note(simulation, counted, cut)
@@ -358,6 +361,20 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     values = simulation.state.t, dt, simulation.scene.numerics.method, failed
     warn(simulation.scene.grid.comm, ResolutionWarning, what, *values)
     return found
+
+
+def _warn_steep(scene: Scene, failed: StepFailed) -> None:
+    """Warn of a retention curve with infinite dk_r/ds at s = 0, if a step failed in the balance of fluid."""
+    if getattr(failed, "field", None) != "storage" or scene.materials.retentions is None:
+        return
+    for law in scene.materials.retentions.laws:
+        if isinstance(law, VanGenuchten) and law.n < 2 and not law.air_entry:
+            what = (
+                "%s: n < 2 without air_entry, so dk_r/ds is infinite at s = 0, and steps may fail or become very short;"
+            )
+            more = " give air_entry, for example the pressure of 0.02 m of water"
+            warn(scene.grid.comm, ConditionWarning, what + more, line(law))
+            return
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State, whole: float) -> bool:
