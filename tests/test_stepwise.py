@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Values that jump in time: every place takes `Stepwise`, and steps of any length give the same results."""
 
+import warnings
+
 import pytest
 
 import mpm_dolfinx as mpm
@@ -52,7 +54,7 @@ def test_a_step_ends_at_the_jump_wherever_the_value_stands(place):
     s.run(2.0, 2.0, t_eval=[0.01, 2.0], progress=False)
     taken = []
     while s.t < 4.4:
-        taken.append(s.state.stage.without_jump(s.t, 1.0))
+        taken.append(s.state.stage.without_jump(s.t, 1.0)[0])
         s.step(taken[-1])
     assert taken == pytest.approx([0.5, 1.0, 1.0], rel=1e-12)
 
@@ -107,3 +109,16 @@ def test_a_displacement_that_jumps_is_refused_with_inertia(make):
     s.run(2.0, 1.0, progress=False)
     s.stage(inertia=True)  # all jumps are over
     s.step(1e-4)
+
+
+def test_equal_steps_after_a_displacement_that_jumps_in_wet_soil_are_named():
+    """With equal steps of 0.5 s, the reaction is +750 kN/m after the jump. It is -45 kN/m in short steps."""
+    top = mpm.Displacement("top", mpm.Stepwise([0, 1], [(0, 0), (0, -2e-3)]), "y", name="top")
+    s = block([top, mpm.Drained("bottom")], **WET)
+    with pytest.warns(mpm.ResolutionWarning, match=r"t = 1 s: a displacement jumps.*; use rtol"):
+        s.run(1.5, 0.5, progress=False)
+    s = block([top, mpm.Drained("bottom")], **WET)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", mpm.ResolutionWarning)
+        s.run(1.5, 0.5, rtol=1e-3, progress=False)
+    assert s.reactions["top"][1] == pytest.approx(-45094, rel=0.01)

@@ -454,6 +454,7 @@ class Displacement(Condition):
     components: str = ""
     region: Region | None = None
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": ("t", "X")}
+    MOVED: ClassVar[tuple[str, ...]] = ("value",)
 
     def axes(self, dim: int) -> list[int]:
         """Return the axes of the prescribed components."""

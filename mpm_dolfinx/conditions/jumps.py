@@ -61,12 +61,24 @@ class Stepwise:
             raise ValueError(f"Stepwise: t = {t:g} s, must not be before the first time, {self.times[0]:g} s")
         return self.values[max(0, np.searchsorted(self._ends, t) - 1)]
 
+    def jumps(self, t: float) -> bool:
+        """Return whether the value changes at time t (s), up to rounding."""
+        k = int(np.searchsorted(self._ends, t))
+        at = 0 < k < len(self.times) and abs(t - self.times[k]) <= self._ends[k] - self.times[k]
+        return bool(at and (self.values[k] != self.values[k - 1]).any())
+
 
 def stepwise(condition: Any) -> dict[str, Stepwise]:
     """Return the `Stepwise` values of a condition by the name of the attribute, for example of a water level."""
     own = getattr(condition, "__dict__", {})
     values = {name: getattr(value, "level", value) for name, value in own.items()}
     return {name: value for name, value in values.items() if isinstance(value, Stepwise)}
+
+
+def motions(condition: Any) -> list[Stepwise]:
+    """Return the `Stepwise` displacements and rotations of a side or a tool."""
+    moved = getattr(condition, "MOVED", ())
+    return [value for name, value in stepwise(condition).items() if name in moved]
 
 
 def functions_of_time(conditions: Iterable[Any], gravity: Any) -> list[Stepwise | Callable[[float], NDArray]]:

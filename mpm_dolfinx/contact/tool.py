@@ -120,6 +120,7 @@ class Tool:
     moment: float | None = None
     spin: float = 0.0
     name: str | None = field(default=None, kw_only=True, repr=False)
+    MOVED: ClassVar[tuple[str, ...]] = ("displacement", "rotation_rad")
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
     _moved: ClassVar[Shape | None] = None
 

@@ -113,6 +113,11 @@ class VanGenuchten(Retention):
         _number(self, "l", lambda v: v == v, "a finite number")
         _number(self, "air_entry", lambda v: v >= 0, ">= 0 and finite")
 
+    @property
+    def steep(self) -> bool:
+        """Whether dk_r/ds is infinite at s = 0."""
+        return self.n < 2 and not self.air_entry
+
     def _wide(self, x):
         """Return q = x^(n-1) (1 + x^n)^-m.  Mualem's relative permeability contains the factor (1 - q)^2."""
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)

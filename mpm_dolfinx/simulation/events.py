@@ -37,8 +37,11 @@ class Simulated(Protocol):
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
         """Return the state after a step of length `dt`, in s, and the report of the step."""
 
-    def without_jump(self, dt: float) -> float:
-        """Return the length of a step, in s: `dt`, or less if a function of time jumps in the step."""
+    def without_jump(self, dt: float) -> tuple[float, bool]:
+        """Return the length of the next step, at most `dt`, in s, and whether a displacement jumps at its start.
+
+        The step ends where a function of time jumps.
+        """
 
 
 class Step(NamedTuple):

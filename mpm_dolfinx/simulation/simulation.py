@@ -353,8 +353,8 @@ class Simulation:
             raise_interrupt(error)
             raise
 
-    def without_jump(self, dt: float) -> float:
-        """Return the length of a step, in s: `dt`, or less if a function of time jumps in the step."""
+    def without_jump(self, dt: float) -> tuple[float, bool]:
+        """Return the length of the next step, at most `dt`, in s, and whether a displacement jumps at its start."""
         return self._state.stage.without_jump(self._state.t, dt)
 
     run, tangent = run, tangent

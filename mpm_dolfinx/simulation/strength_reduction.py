@@ -227,9 +227,9 @@ class _Trial:
         self.newton.append(report.newton)
         return replace(state, t=self.state.t + dt), report
 
-    def without_jump(self, dt: float) -> float:
-        """Return `dt`, because loads do not jump."""
-        return dt
+    def without_jump(self, dt: float) -> tuple[float, bool]:
+        """Return `dt` and False, because nothing jumps."""
+        return dt, False
 
 
 class _Weakened:

@@ -25,7 +25,6 @@ from mpm_dolfinx.base.validation import flag, functions, instance, line
 from mpm_dolfinx.dynamics.energies import drift, initial_energies
 from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, log, logger, warn
-from mpm_dolfinx.pores.retention import VanGenuchten
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
 from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step, check_alike
@@ -309,7 +308,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         result = simulation.state.result
         control = simulation.state.control
         size, how = rule.fitted(target - state.t, control.small), ()
-        size = simulation.without_jump(size)
+        size, sudden = simulation.without_jump(size)
+        if sudden and not (whole or rule.by_error):
+            _warn_sudden(simulation)
         preferred, whole = preferred or rule.preferred(size), whole or size
         halved = halved or rule.whole(size, control.small)
         try:
@@ -363,12 +364,20 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     return found
 
 
+def _warn_sudden(simulation: Simulated) -> None:
+    """Warn of a displacement that jumps in a scene with flow of fluid."""
+    if len(simulation.scene.substeps(simulation.state.stage)) > 1:
+        what = "t = %g s: a displacement jumps, and equal steps are too long for the sudden pore pressures; use rtol"
+        more = ", or a function that is continuous in time"
+        warn(simulation.scene.grid.comm, ResolutionWarning, what + more, simulation.state.t)
+
+
 def _warn_steep(scene: Scene, failed: StepFailed) -> None:
     """Warn of a retention curve with infinite dk_r/ds at s = 0, if a step failed in the balance of fluid."""
     if getattr(failed, "field", None) != "storage" or scene.materials.retentions is None:
         return
     for law in scene.materials.retentions.laws:
-        if isinstance(law, VanGenuchten) and law.n < 2 and not law.air_entry:
+        if getattr(law, "steep", False):
             what = (
                 "%s: n < 2 without air_entry, so dk_r/ds is infinite at s = 0, and steps may fail or become very short;"
             )

@@ -28,10 +28,8 @@ from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Place
-from mpm_dolfinx.conditions.conditions import Displacement, Quiet, Tied
-from mpm_dolfinx.conditions.jumps import stepwise
+from mpm_dolfinx.conditions.conditions import Quiet, Tied
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
-from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
 from mpm_dolfinx.dynamics.at_rest import balancing_tractions
@@ -75,7 +73,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
             f"{next(iter(quiet))}: cannot balance initial stress, must begin in a later stage: first prescribe the side"
         )
     _check_weight(first, None, 0.0)
-    _check_motions(first, 0.0)
+    first.check_motions(0.0)
     _warn_dammed(scene, first, 0.0)
     scene.check_followed(first)
     comm, gravity = scene.grid.comm, first.conditions["gravity"]
@@ -127,7 +125,7 @@ def begin_stage(
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
     after = scene.stage({**before.conditions, **named, "conditions": conditions}, present, later)
     _check_weight(after, before, state.t)
-    _check_motions(after, state.t)
+    after.check_motions(state.t)
     _warn_dammed(scene, after, state.t)
     for one in after.feeding:
         one.check(Beginning(state.points, after.named.keys() - before.named.keys(), after.gravity_at(state.t)))
@@ -278,14 +276,6 @@ def _holds_as(after: Stage, before: Stage) -> bool:
         hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
         for (hold, faces, _), (was, then, _) in zip(after.held, before.held, strict=True)
     )
-
-
-def _check_motions(stage: Stage, t: float) -> None:
-    """Raise ValueError if a stage with inertia prescribes a displacement that jumps after the time `t`, in s."""
-    for name, one in stage.of(Displacement, Tool).items() if stage.inertia else ():
-        for value in (value for motion, value in stepwise(one).items() if motion != "load"):
-            if any((value(time) != value.values[-1]).any() for time in (t, *value.times[value.times > t])):
-                raise ValueError(f"{name}: {line(one)} jumps, must be continuous with inertia")
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:

@@ -30,7 +30,7 @@ from mpm_dolfinx.conditions.conditions import (
     Tied,
     Traction,
 )
-from mpm_dolfinx.conditions.jumps import before_jumps, functions_of_time
+from mpm_dolfinx.conditions.jumps import before_jumps, functions_of_time, motions
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.conditions.walls import fixed_corners, fixed_nodes, with_axis
@@ -141,10 +141,21 @@ class Stage:
     def _functions_of_time(self) -> list:
         return functions_of_time(self.given.values(), self.conditions["gravity"])
 
-    def without_jump(self, t: float, dt: float) -> float:
-        """Return the length of a step from t (s): `dt` (s), or less if a function of time jumps in the step."""
+    def without_jump(self, t: float, dt: float) -> tuple[float, bool]:
+        """Return the length of a step from t (s), in s, and whether a displacement of a side or a tool jumps at t.
+
+        The length is `dt`, or less if a function of time jumps in the step.
+        """
         end = before_jumps(self._functions_of_time, t, t + dt)
-        return dt if end == t + dt else end - t
+        sudden = any(value.jumps(t) for one in self.given.values() for value in motions(one))
+        return dt if end == t + dt else end - t, sudden
+
+    def check_motions(self, t: float) -> None:
+        """Raise ValueError if a displacement of a stage with inertia jumps after the time `t`, in s."""
+        for name, one in self.given.items() if self.inertia else ():
+            for value in motions(one):
+                if any((value(time) != value.values[-1]).any() for time in (t, *value.times[value.times > t])):
+                    raise ValueError(f"{name}: {line(one)} jumps, must be continuous with inertia")
 
     @property
     def faces(self) -> list[Surface]:
