@@ -38,13 +38,14 @@ def motion_error(
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights
-    rate, M = 1 / own**2, mass.M
+    rate = 1 / own**2
+    S = mass.stiffness(rate)
     energy = 0.0
     for one, other, stiff in ((first.acceleration, last.acceleration, False), (first.velocity, last.velocity, True)):
         off = other - one
         off.scale(ERROR * seconds)
         filtered = off.duplicate()
-        solvers.solve_u.solve(M * off * rate, filtered)
-        inert = filtered.dot(M * filtered)
-        energy += filtered.dot(K * filtered) - rate * inert if stiff else inert
+        solvers.solve_u.solve(S * off, filtered)
+        inert = filtered.dot(S * filtered)
+        energy += filtered.dot(K * filtered) - inert if stiff else inert / rate
     return float(np.sqrt(max(energy, 0.0))), mass.size(last.velocity, drift)

@@ -2,8 +2,9 @@
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
 The ghost penalty adds the term `gamma s 2G h/3 int [d_n u].[d_n v] dS` over faces between cells.  Here u is the
-displacement increment of the step, v the test function, and [d_n u] the jump of the normal derivative.  Gamma is
-`GHOST`, G the shear modulus, and h the cell size.  The factor s is between 0 and 1 for each face:
+displacement increment of the step, v the test function, and [d_n u] the jump of the normal derivative.  With inertia, u
+is the increment minus the inertial predictor (`inertia`).  Gamma is `GHOST`, G the shear modulus, and h the cell size.
+The factor s is between 0 and 1 for each face:
 
     s = max(0, 1 - f_1 / (RATIO f_2)) (f_2 / f_3)^2,     f_1 <= f_2,
 

@@ -21,6 +21,11 @@ The ghost mass `G = c rho h^3 int [[d_n N]] [[d_n N]] dS` acts on faces of cells
 `GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the normal derivative.  The ghost mass has no effect on
 affine velocity fields.  The transfer to the grid and back conserves linear and angular momentum to rounding.
 
+The ghost penalty P (`ghost_penalty`) has the force P (u - u^) = (g dt)^2 P a, so (g dt)^2 P is part of the mass, also
+in the equation of v_n.  On the displacement u of the step, the penalty would be a viscosity and would dissipate energy.
+In long steps, (g dt)^2 P removes the kinks from v_n and u^ at faces with a penalty.  The penalty then acts as without
+inertia, and kinks of a fast vibration do not become displacements.
+
 A material point stores the velocity v and the rate F' of F.  The velocity in its domain is v + F' F^-1 (x - x_p), with
 the position x_p of the point.  Increments of nodal velocities give the increments of v and F' (Brackbill and Ruppel
 1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is a midpoint rule, corrected
@@ -34,6 +39,7 @@ from functools import cached_property, partial
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -42,7 +48,7 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -218,6 +224,7 @@ class InertiaForms:
         facets: NDArray[np.int32],
         unknowns: Unknowns,
         held: Unknowns,
+        penalty: Loads,
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
@@ -225,6 +232,7 @@ class InertiaForms:
         `fill` (cells,): volume fractions of the local cells.
         `facets`: faces between two active cells, at least one of them not full.
         `unknowns`: unknown displacements.  `held`: displacements that walls of the grid fix.
+        `penalty`: ghost penalty.
         """
         grid = self.grid
         of_pieces = cut.shares(mass)
@@ -240,12 +248,15 @@ class InertiaForms:
         i, j = np.triu_indices(nodes)
         of_cells[:, i, j] = of_cells[:, j, i] = self._mass(pieces)
         for of in (unknowns, held):
-            A = matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1))
-            A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the mass does not couple the axes
-            insert_for_each_axis(A, grid.cell_nodes[places.filled], grid.dim, of_cells)
-            ghost.assemble_matrix(A)
-            A.assemble()
-            matrices.append(A)
+            M, P = (matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)) for _ in range(2))
+            for A in (M, P):
+                A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
+            insert_for_each_axis(M, grid.cell_nodes[places.filled], grid.dim, of_cells)
+            ghost.assemble_matrix(M)
+            penalty.penalty(P, of is held)
+            for A in (M, P):
+                A.assemble()
+                matrices.append(A)
         return Mass(self, cut, pieces, unknowns, *matrices)
 
 
@@ -253,35 +264,50 @@ class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
     `pieces`: integration points of the pieces, with masses, in kg, as weights.
-    `M`: mass matrix, in kg, with the rows of the unknowns.
-    `held`: mass matrix, in kg, with the rows of displacements that walls of the grid fix.
+    `M`, `ghost`: mass matrix, in kg, and ghost penalty, in N/m, with the rows of the unknowns.
+    `held`, `held_ghost`: the same matrices with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
-        self, forms: InertiaForms, cut: CutDomains, pieces: PointData, unknowns: Unknowns, M: PETSc.Mat, held: PETSc.Mat
+        self,
+        forms: InertiaForms,
+        cut: CutDomains,
+        pieces: PointData,
+        unknowns: Unknowns,
+        M: PETSc.Mat,
+        ghost: PETSc.Mat,
+        held: PETSc.Mat,
+        held_ghost: PETSc.Mat,
     ):
-        self._forms, self._cut, self._pieces, self.unknowns, self.M, self.held = forms, cut, pieces, unknowns, M, held
+        self._forms, self._cut, self._pieces, self.unknowns = forms, cut, pieces, unknowns
+        self.M, self.ghost = M, ghost
+        self._held, self._held_ghost = held, held_ghost
         self._work, self._stiffness = (unknowns.vector(), unknowns.vector()), Latest()
         self._solver = ksp = PETSc.KSP().create(unknowns.comm)
         ksp.setType(PETSc.KSP.Type.CG)
         ksp.getPC().setType(PETSc.PC.Type.JACOBI)
-        ksp.setOperators(M)
-        ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
+        ksp.setTolerances(rtol=ROUND_OFF, atol=0.0, divtol=np.inf)
 
     def forces(self, u: NDArray[np.float64], flight: PETSc.Vec, rate: float) -> PETSc.Vec:
         """Return the inertia forces at u, in N.  The next call overwrites the vector."""
         moved, forces = self._work
         self.unknowns.gather(u, moved).axpy(-1.0, flight)
-        moved.scale(rate)
-        self.M.mult(moved, forces)
+        self.stiffness(rate).mult(moved, forces)
         return forces
+
+    def held_forces(self, moved: PETSc.Vec, rate: float) -> PETSc.Vec:
+        """Return the inertia forces, in N, at fixed nodes.  `moved`, in m: displacement minus the predictor."""
+        return self._held * moved * rate + self._held_ghost * moved
 
     def stiffness(self, rate: float) -> PETSc.Mat:
         """Return the derivative, in N/m, of the inertia forces with respect to u.  `rate`, in 1/s^2: see `Inertia`."""
-        return self._stiffness(rate, lambda: self.M * rate)
+        return self._stiffness(rate, lambda: self.M * rate + self.ghost)
 
-    def velocity(self, points: MaterialPoints) -> PETSc.Vec:
-        """Return the velocities of the unknowns, in m/s, projected from the velocities of the points."""
+    def velocity(self, points: MaterialPoints, rate: float) -> PETSc.Vec:
+        """Return the velocities of the unknowns, in m/s, projected from the velocities of the points.
+
+        `rate`, in 1/s^2: see `Inertia`.
+        """
         cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
         (off, second), of = self._moments, cut.pieces.point
         L = columns(velocity_gradients(points)).take(of, axis=2)
@@ -293,6 +319,9 @@ class Mass:
         b[dofs] = sum_by(at, sums.ravel(), len(dofs))
         rhs = self.unknowns.gather(sum_ghosts(forms.work), self.unknowns.vector())
         out = self.unknowns.vector()
+        rate = max(rate, self._least_rate)
+        rhs.scale(rate)
+        self._solver.setOperators(self.stiffness(rate))
         self._solver.solve(rhs, out)
         return out
 
@@ -347,6 +376,12 @@ class Mass:
         off, second = self._moments
         return inverses(self._mean(off[:, None] * off + second))
 
+    @cached_property
+    def _least_rate(self) -> float:
+        """Smallest `rate`, in 1/s^2, for which the sum of mass and ghost penalty has half of the digits of the mass."""
+        ratio = self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
+        return SAME * self._forms.grid.comm.allreduce(ratio.max(initial=0.0), MPI.MAX)
+
     def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the volume-weighted mean (..., n) of values (..., m) over the pieces of each point."""
         pieces = self._cut.pieces
@@ -389,9 +424,12 @@ class Inertia(Loads):
 
     def acceleration(self, at: At) -> PETSc.Vec:
         """Return the accelerations of the unknowns at u, in m/s^2."""
+        return self._moved(at) * self.rate
+
+    def _moved(self, at: At) -> PETSc.Vec:
+        """Return the displacements of the unknowns minus the predictor, in m."""
         u = at.unknowns.gather(at.u, at.unknowns.vector())
         u.axpy(-1.0, self._flight)
-        u.scale(self.rate)
         return u
 
     def inertia(self, at: At) -> PETSc.Vec:
@@ -408,7 +446,7 @@ class Inertia(Loads):
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the inertia forces to the residual at fixed nodes."""
         if on is not self._mass.unknowns:
-            residual += self._mass.held * self.acceleration(at)
+            residual += self._mass.held_forces(self._moved(at), self.rate)
 
     def coupling(self, at: At) -> PETSc.Mat:
         """See `Loads`."""

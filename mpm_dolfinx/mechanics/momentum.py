@@ -333,7 +333,8 @@ class MomentumSystem:
         at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
         at_walls[held // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
-        self._ghost = forms.ghost.on(facets, facets[near])
+        self.ghost = forms.ghost.on(facets, facets[near])
+        """The ghost penalty."""
         self.elastic_shear, self._elastic_shear = None, None  # None in scenes without yielding
         if not forms.elastic:
             self.elastic_shear = matrix(self.unknowns, self.unknowns, 3**d * d)
@@ -381,10 +382,10 @@ class MomentumSystem:
         return A
 
     def set_penalty(self, loads: Sequence[Loads]) -> None:
-        """Assemble the matrices of ghost penalty, penalties of loads, and regularisation, which do not depend on u."""
+        """Assemble the matrices of penalties and regularisation, which do not depend on u."""
         for penalty in (self.held_penalty, self.penalty):
             zero(penalty)
-            for one in (self._ghost, *loads):
+            for one in loads:
                 one.penalty(penalty, penalty is self.held_penalty)
             penalty.assemble()
         if self.elastic_shear is not None:

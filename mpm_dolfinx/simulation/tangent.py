@@ -74,7 +74,10 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     momentum, storage = both.momentum, both.storage
     momentum.assemble_residual()
     unknowns = momentum.system.unknowns
-    blocks = {"stiffness": _csr(momentum.assemble_tangent()), "x": unknowns.positions}
+    K = momentum.assemble_tangent()
+    if state.stage.inertia:
+        K = K + start.matrices.mass.ghost
+    blocks = {"stiffness": _csr(K), "x": unknowns.positions}
     blocks |= dict(zip(("nodes", "components"), unknowns.nodes, strict=True))
     if storage is not None:
         storage.assemble_residual()

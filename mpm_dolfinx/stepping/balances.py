@@ -50,6 +50,11 @@ class Start(NamedTuple):
     renewed: int = 0  # number of renewed particle domains
     due: NDArray[np.float64] | None = None  # corrections of volume defects, see `OnGrid.start`
 
+    @property
+    def rate(self) -> float:
+        """Derivative of acceleration with respect to displacement, equal in all substeps, in 1/s^2."""
+        return 1 / float(self.acting[0].substep.own * self.dt) ** 2
+
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
         """Return the loads at the beginning of a substep. `earlier`: data of the loads in the previous substep."""
         if not self.state.stage.inertia:
@@ -154,7 +159,7 @@ def flight_of(start: Start) -> Flight | None:
     mass = start.matrices.mass
     if mass is None:
         return None
-    v = mass.velocity(start.state.points)
+    v = mass.velocity(start.state.points, start.rate)
     return Flight(v, v)
 
 
@@ -199,7 +204,7 @@ def balances(
     loads = acting.loads
     if flight is not None:
         own = float(substep.own * dt)
-        inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
+        inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), start.rate)
         loads = [*loads, inertia]
         u = inertia.flight  # all other initial guesses cause large inertia forces that hide the imbalance
     if scene.momentum.inertia is not None:

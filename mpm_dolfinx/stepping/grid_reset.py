@@ -31,7 +31,7 @@ from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets, off_middle
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
-from mpm_dolfinx.mechanics.ghost_penalty import FULL, stiffness
+from mpm_dolfinx.mechanics.ghost_penalty import FULL, RATIO, stiffness
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -139,7 +139,8 @@ class OnGrid(Keyed):
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
         """Faces with a ghost mass: faces between a partly filled cell and another active cell."""
-        return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
+        fill = self.fill[self.cut.grid.facet_cells[self.facets]]
+        return self.facets[fill.min(axis=1) < np.maximum(FULL, RATIO * fill.max(axis=1))]  # includes `penalised`
 
     @property
     def masses(self) -> NDArray[np.float64]:
@@ -552,12 +553,11 @@ class Assembled(Keyed):
         self._by_pressure = storage.p_before if by_pressure else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
-        self.momentum.set_penalty(loads)
-        self.mass = None
+        own, self.mass = self.momentum, None
+        own.set_penalty(loads if stage.inertia else [own.ghost, *loads])
         if stage.inertia:
-            own = self.momentum
             where = on_grid.cut, on_grid.masses, on_grid.fill, on_grid.not_full
-            self.mass = momentum.inertia.on(*where, own.unknowns, own.held)
+            self.mass = momentum.inertia.on(*where, own.unknowns, own.held, own.ghost)
             own.mass = self.mass.M
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
