@@ -67,7 +67,8 @@ class Start(NamedTuple):
         """Return the argument `carried` of `Motion.advanced`, or None without inertia."""
         if flight is None:
             return None
-        return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
+        velocities = flight.start, flight.velocity
+        return partial(self.matrices.mass.carried, self.state.points, velocities, self.rate)
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
         """Return the error and the size of the motion in the step (`motion_error`), or zeros if the run needs neither.
