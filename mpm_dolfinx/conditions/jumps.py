@@ -100,7 +100,7 @@ def before_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], sta
     for function in functions:
         if isinstance(function, Stepwise):
             later = function.times[function.times > start + near]
-            end = min([end, *later[:1]])
+            end = min([end, *later[:1].tolist()])
             continue
         while end - start > 2 * near and (jump := _jump(function, start + near, end, near / 4)) is not None:
             end = jump
@@ -127,4 +127,4 @@ def _jump(of: Callable[[float], NDArray], low: float, high: float, near: float) 
             low, first = middle, value
         if abs(last - first) <= size * np.sqrt((high - low) / length):
             return None
-    return low - near
+    return float(low - near)
