@@ -21,8 +21,8 @@ class Stepwise:
     """Piecewise constant function of time, such as recorded rates of rain, for values of conditions and for gravity.
 
     The value `values[k]` begins after `times[k]`, and remains until `times[k + 1]`.  The value at `times[0]` is
-    `values[0]`, and the last value has no end.  Steps end at all `times`, so volumes of rain and inflow are exact to
-    rounding.  Results at `times[k]`, and factors of safety at this time, belong to the value before `times[k]`.
+    `values[0]`, and the last value has no end.  Steps of `run` end at all `times`, so volumes of rain and inflow are
+    exact to rounding.  Results and factors of safety at `times[k]` belong to the value before `times[k]`.
 
     Parameters
     ----------
