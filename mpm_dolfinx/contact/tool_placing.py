@@ -261,6 +261,8 @@ class Tools(Touching):
 
     def _normals(self, tool: Tool, pose: Pose, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the outward unit normals (m, d) of a tool at positions x (m, d)."""
+        if self.grid.axisymmetric:  # beyond the axis is the mirror image, so the tip of a cone is no edge
+            x = np.column_stack([np.abs(x[:, 0]), x[:, 1]])
         n = together(self.grid.comm, lambda: tool.solid(self.grid.least).normal(pose.own(x)) @ pose.R.T)
         return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), TINY)
 
