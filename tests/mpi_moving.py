@@ -84,7 +84,7 @@ def state(simulation):
 if __name__ == "__main__":
     out, file = map(Path, sys.argv[1:])
     make = {"carried": carried, "dug": dug}[out.stem.split("-")[0]]
-    DT = T_END / 2 if make is carried else DT
+    DT = T_END / 4 if make is carried else DT
     if MPI.COMM_WORLD.size == 2:
         reproduce()
     simulation = make()
