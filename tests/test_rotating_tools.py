@@ -164,3 +164,29 @@ def test_rotations_in_space_and_about_the_axis_are_refused():
     tool = mpm.Tool(mpm.Ball((0, 0.8), 0.2), mass=1.0, spin=1.0)
     with pytest.raises(ValueError, match="must be left out in axisymmetry"):
         mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.3])], [ROCK], conditions=[tool], walls=RIM, inertia=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cells", "turns", "error"), [(5, 5.0, 0.03), (10, 0.25, 0.015)])
+def test_the_torque_of_a_rough_disc_in_clay_is_steady(cells, turns, error):
+    """The torque is 2 pi r^2 s_u. The poles of the disc are in the middle of cells, and clay slips along the disc."""
+    strength, h = 1e3, 1 / cells
+    grid = mpm.Grid([-2, -2], [2, 2 + 4 * h], [4 * cells, 4 * cells + 4])
+    angle = np.linspace(0, 2 * np.pi, 16 * cells, endpoint=False)
+    centre = np.array([0.5 * h, 0.5 * h])
+    hole = centre + np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    corners, names = [[-2, -2], [2, -2], [2, 2 + 0.5 * h], [-2, 2 + 0.5 * h]], ["bottom", "right", "top", "left"]
+    clay = mpm.polygon(grid, corners, names, holes={"hole": hole}, size=h / 2)
+    soil = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=strength)
+    turn = {"rotation_rad": lambda t: max(0.0, t - 1), "centre": centre, "adhesion": strength}
+    disc = mpm.Tool(mpm.Ball(centre, 1.0), **turn, name="disc")
+    confined = mpm.Pressure("top", lambda t: 5 * strength * min(1, t))
+    walls = {"left": "xy", "right": "xy", "bottom": "xy"}
+    numerics = mpm.Numerics(renewal=True)
+    s = mpm.Simulation(grid, [clay], [soil], walls=walls, conditions=[confined, disc], numerics=numerics)
+    torques = []
+    s.run(1.0, 1.0, progress=False)
+    s.run(1 + 2 * np.pi * turns, h / 2, observe=[lambda s: torques.append(s.tool_forces["disc"][-1])], progress=False)
+    means = [part.mean() for part in np.array_split(torques[len(torques) // 10 :], 5)]
+    assert means == pytest.approx(np.full(5, 2 * np.pi * strength), rel=error)
+    assert np.ptp(means) < 0.003 * turns * means[0]
