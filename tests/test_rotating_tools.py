@@ -167,10 +167,10 @@ def test_rotations_in_space_and_about_the_axis_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cells", "turns", "error"), [(5, 5.0, 0.03), (10, 0.25, 0.015)])
-def test_the_torque_of_a_rough_disc_in_clay_is_steady(cells, turns, error):
+def test_the_torque_of_a_rough_disc_in_clay_is_steady():
     """The torque is 2 pi r^2 s_u. The poles of the disc are in the middle of cells, and clay slips along the disc."""
-    strength, h = 1e3, 1 / cells
+    strength, cells = 1e3, 5
+    h = 1 / cells
     grid = mpm.Grid([-2, -2], [2, 2 + 4 * h], [4 * cells, 4 * cells + 4])
     angle = np.linspace(0, 2 * np.pi, 16 * cells, endpoint=False)
     centre = np.array([0.5 * h, 0.5 * h])
@@ -186,7 +186,7 @@ def test_the_torque_of_a_rough_disc_in_clay_is_steady(cells, turns, error):
     s = mpm.Simulation(grid, [clay], [soil], walls=walls, conditions=[confined, disc], numerics=numerics)
     torques = []
     s.run(1.0, 1.0, progress=False)
-    s.run(1 + 2 * np.pi * turns, h / 2, observe=[lambda s: torques.append(s.tool_forces["disc"][-1])], progress=False)
+    s.run(1 + 2 * np.pi, h / 2, observe=[lambda s: torques.append(s.tool_forces["disc"][-1])], progress=False)
     means = [part.mean() for part in np.array_split(torques[len(torques) // 10 :], 5)]
-    assert means == pytest.approx(np.full(5, 2 * np.pi * strength), rel=error)
-    assert np.ptp(means) < 0.003 * turns * means[0]
+    assert means == pytest.approx(np.full(5, 2 * np.pi * strength), rel=0.03)
+    assert np.ptp(means) < 0.003 * means[0]
