@@ -294,14 +294,14 @@ class Simulation:
     ) -> None:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        Stresses and pressures change in the next `run`.  Present values as arguments do not change the state.
+        Stresses and pressures change in the next `run`.  A stage with the present values changes nothing.
 
         Parameters
         ----------
         walls, gravity
             New walls and new gravity, as for `Simulation`.  A scene without gravity cannot get gravity later.
         inertia
-            Whether bodies have inertia, beginning without velocity; not in a scene created with `inertia=None`.
+            Whether bodies have inertia; they start without velocity.  A scene made with `inertia=None` has none.
         conditions
             All conditions from now on; by default the present conditions.  To add a condition `new`, pass
             `[*simulation.conditions, new]`.  Every `Contact` remains in force, even if it is not listed.
