@@ -171,45 +171,59 @@ def _placed(file: Path) -> list[_Placed]:
 
 def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str]) -> None:
     """Add the nodes, elements, sets or surfaces of one keyword to a scope."""
-    if keyword == "NODE" and rows:
-        if options.get("SYSTEM", "R").upper() != "R":
-            raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: coordinates must be Cartesian")
-        rows = [row.upper().replace("D", "E") + ",0,0,0" for row in rows]  # exponents as in Fortran, 1D3
-        x = np.array([[float(v.strip() or 0) for v in row.split(",")[:4]] for row in rows])
-        scope.nodes.append((x[:, 0].astype(np.int64), x[:, 1:]))
-    elif keyword == "ELEMENT" and rows:
-        if not (kind := _kind(options["TYPE"])):
-            rows = []  # elements without volume or area
-        if not rows and "ELSET" in options:
-            scope.entry(options, "", np.empty(0, np.int64))
-        if not rows:
-            return
-        numbers = np.array([int(v) for row in rows for v in row.split(",") if v.strip()])
-        width = 1 + _nodes(kind)
-        if len(numbers) % width:
-            raise ValueError(
-                f"*ELEMENT, TYPE={options['TYPE']}: {len(numbers)} numbers, must be {width} for each element"
-            )
-        table = numbers.reshape(-1, width)
+    if keyword in DEFINED:
+        DEFINED[keyword](scope, options, rows)
+
+
+def _add_nodes(scope: _Scope, options: dict[str, str], rows: list[str]) -> None:
+    if not rows:
+        return
+    if options.get("SYSTEM", "R").upper() != "R":
+        raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: coordinates must be Cartesian")
+    rows = [row.upper().replace("D", "E") + ",0,0,0" for row in rows]  # exponents as in Fortran, 1D3
+    x = np.array([[float(v.strip() or 0) for v in row.split(",")[:4]] for row in rows])
+    scope.nodes.append((x[:, 0].astype(np.int64), x[:, 1:]))
+
+
+def _add_elements(scope: _Scope, options: dict[str, str], rows: list[str]) -> None:
+    if not rows:
+        return
+    numbers = np.empty(0, np.int64)
+    if kind := _kind(options["TYPE"]):  # elements with volume or area
+        values, width = np.array([int(v) for row in rows for v in row.split(",") if v.strip()]), 1 + _nodes(kind)
+        if len(values) % width:
+            what = f"*ELEMENT, TYPE={options['TYPE']}: {len(values)} numbers"
+            raise ValueError(f"{what}, must be {width} for each element")
+        table = values.reshape(-1, width)
+        numbers = table[:, 0]
         nodes = table[:, [1, 3, 2]] if kind == "line3" else table[:, 1:]  # the second node is the middle in Abaqus
-        scope.cells.append((kind, table[:, 0], nodes))
-        if "ELSET" in options:
-            scope.entry(options, "", table[:, 0])
-    elif keyword == "ELSET":
-        words = [[v for v in map(str.strip, row.split(",")) if v] for row in rows]
-        if "GENERATE" in options:
-            spans = [[*map(int, row), 1][:3] for row in words]
-            words = [[str(v) for v in range(a, b + 1, step)] for a, b, step in spans]
-        words = [v.strip('"') for row in words for v in row]
-        numbers = [int(v) for v in words if v.isdigit()]
-        scope.entry(options, options.get("INSTANCE", ""), np.array(numbers, dtype=np.int64))
-        for word in (v for v in words if not v.isdigit()):
-            instance, _, name = word.rpartition(".")
-            instance = instance or options.get("INSTANCE", "")
-            scope.entry(options, instance, np.array([int(name)]) if name.isdigit() else name.upper())
-    elif keyword == "SURFACE" and options.get("TYPE", "ELEMENT").upper() == "ELEMENT" and "COMBINE" not in options:
+        scope.cells.append((kind, numbers, nodes))
+    if "ELSET" in options:
+        scope.entry(options, "", numbers)
+
+
+def _add_set(scope: _Scope, options: dict[str, str], rows: list[str]) -> None:
+    words = [[v for v in map(str.strip, row.split(",")) if v] for row in rows]
+    if "GENERATE" in options:
+        spans = [[*map(int, row), 1][:3] for row in words]
+        words = [[str(v) for v in range(a, b + 1, step)] for a, b, step in spans]
+    words = [v.strip('"') for row in words for v in row]
+    numbers = [int(v) for v in words if v.isdigit()]
+    scope.entry(options, options.get("INSTANCE", ""), np.array(numbers, dtype=np.int64))
+    for word in (v for v in words if not v.isdigit()):
+        instance, _, name = word.rpartition(".")
+        instance = instance or options.get("INSTANCE", "")
+        scope.entry(options, instance, np.array([int(name)]) if name.isdigit() else name.upper())
+
+
+def _add_surface(scope: _Scope, options: dict[str, str], rows: list[str]) -> None:
+    if options.get("TYPE", "ELEMENT").upper() == "ELEMENT" and "COMBINE" not in options:
         pairs = [(*(v.strip() for v in row.split(",")), "")[:2] for row in rows]
         scope.surfaces[options["NAME"].upper()] = options["NAME"], pairs
+
+
+DEFINED = {"NODE": _add_nodes, "ELEMENT": _add_elements, "ELSET": _add_set, "SURFACE": _add_surface}
+"""Functions that add the rows of a keyword to a scope."""
 
 
 def _kind(name: str) -> str:

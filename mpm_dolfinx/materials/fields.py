@@ -82,33 +82,28 @@ class SceneMaterials:
     ):
         self.grid = grid
         self.fluid = fluid
-        seeded: dict[str, NDArray[np.float64]] = dict(points.data)
         self._used = _used(bodies, len(materials))  # a material without a body has no effect
         rows = {i: (points.material == i).nonzero()[0] for i in self._used}
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
-        def at_points() -> list[tuple[Skeleton, Skeleton]]:
+        def at_points(of: Sequence[Skeleton]) -> list[tuple[Skeleton, Skeleton]]:
             """Return two copies of each used material: one for this process's points, and one for a single point."""
-            return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
+            return [_evaluated(grid, of[i], places[i], points.id[rows[i]]) for i in self._used]
 
-        evaluated, at_first = zip(*at_points(), strict=True)
+        evaluated, at_first = zip(*at_points(materials), strict=True)
         locks = [over_all(grid.comm, bool(np.any(m.nearly_incompressible)), MPI.LOR) for m in evaluated]
         in_space = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
         known = [not needed or knows_space(grid, m) for m, needed in zip(at_first, in_space, strict=True)]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
         """Number of rows of the deformation gradients that laws receive, 2 or 3."""
-        if self.across:
-            seeded[ACROSS] = np.ones(len(points))
         if prestressed:
             whole = dict(zip(self._used, known, strict=True))
             materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
-            evaluated = [m for m, _ in at_points()]
+            evaluated = [m for m, _ in at_points(materials)]
         self.materials, self._evaluated = materials, evaluated
         used = [materials[i] for i in self._used]
         self._fields = [_by_place(m) for m in materials]
         self.laws = list(dict.fromkeys(map(type, used)))
-        self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
-        """Distinct conductivity laws of the scene."""
         kinds = list(zip(map(type, used), locks, known, strict=True))
         self._parts = list(dict.fromkeys(kinds))
         own = dict(zip(self._used, kinds, strict=True))
@@ -118,54 +113,51 @@ class SceneMaterials:
         moduli = [m.oedometric for m in evaluated], [m.shear for m in evaluated]
         self.varied = any(most > 2 * least for least, most in (_ends(grid, of) for of in moduli))
         """Whether stiffness differs between points by more than a factor of two."""
-        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
-        self.conducts |= any(callable(m.conductivity) for m in used)
+        self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
+        """Distinct conductivity laws of the scene."""
+        self.conducts = any(map(_conducts, [*evaluated, *used]))
         """Whether fluid flows in the scene, or may flow in a later stage."""
         least, most = _ends(grid, [m.conductivity for m in evaluated])
-        by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
-        self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or most > least
-        self.layered = self.layered or len({m.retention for m in used}) > 1
+        self.layered = most > least or _layered(used)
         """Whether the conductivity may differ between points."""
-        self.checksums: dict[str, int | list[float]] = {
-            f"conductivity law of material {i}": sampled(m.conductivity_law)
-            for i, m in zip(self._used, used, strict=True)
-            if m.conductivity_law
-        }
+        self.checksums: dict[str, int | list[float]] = _samples(dict(zip(self._used, used, strict=True)))
         """For checkpoints: checksums of varying constants, and samples of conductivity laws and retention curves."""
-        for i, m in zip(self._used, used, strict=True):
-            if m.retention is not None:
-                self.checksums[f"retention of material {i}"] = drained(m.retention)
         self.check_cells()
         self.shapes: dict[str, tuple[int, ...]] = {}
         """Shapes of parameters and state variables at a point, by name."""
+        seeded = dict(points.data)
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
-            count, own = max(1, len(rows[i])), rows[i]
+            count = max(1, len(rows[i]))
             together(grid.comm, partial(self._add_shapes, _expanded(m, values, count), seeded, len(points)))
             for name, value in values.items():
-                filled = np.zeros((len(points), *value.shape[1:]))
+                filled, own = np.zeros((len(points), *value.shape[1:])), rows[i]
                 filled[own] = value[: len(own)]
                 checksum = _checksum(grid, points.id[own], filled[own], sum(map(len, bodies)))
                 self.checksums[f"checksum of {name} of material {i}"] = checksum
                 seeded[name] = filled + seeded[name] if name in seeded else filled
-        seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
-        if prestressed and "plastic" in seeded:
-            seeded["plastic" + AT_REST] = seeded["plastic"]
-        self._softness: dict[int, SoftnessAtPoints] = {}
-        if fluid is not None:
-            seeded |= {"owed": np.zeros(len(points)), "due": np.zeros(len(points))}
-        if fluid is not None and self.evolves:
-            seeded["softness"] = np.ones(len(points))
-            for number, law in enumerate(self.laws):
-                if law.state:
-                    shapes = {name: self.shapes[name] for name in _takes(law)}
-                    self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
-        self.seeded = replace(points, data=seeded)
+        self.seeded = replace(points, data=seeded | self._at_start(points, seeded, prestressed))
         """Material points with their initial state, and with the parameters that are functions of position."""
-        self._at_points = [
-            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
-            for law in self.laws
+        given = [
+            (grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law)) for law in self.laws
         ]
+        self._at_points = [LawAtPoints(*of) for of in given]
+        soft = "softness" in self.seeded.data
+        self._softness = {k: SoftnessAtPoints(*of) for k, of in enumerate(given) if soft and self.laws[k].state}
+
+    def _at_start(
+        self, points: MaterialPoints, state: dict[str, NDArray[np.float64]], prestressed: bool
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return the initial values of the fields that the scene adds to the state variables `state` of its laws."""
+        out = {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in state}
+        if self.across:
+            out[ACROSS] = np.ones(len(points))
+        if prestressed and "plastic" in state:
+            out["plastic" + AT_REST] = state["plastic"]
+        if self.fluid is not None:
+            out |= {"owed": np.zeros(len(points)), "due": np.zeros(len(points))}
+            out |= {"softness": np.ones(len(points))} if self.evolves else {}
+        return out
 
     def seeds_no_more(self) -> None:
         """Delete the seeded points, which are needed only to add bodies."""
@@ -582,6 +574,29 @@ def _known(name: str, value) -> NDArray[np.float64]:
 
 def _names_place(law: Callable) -> bool:
     return "x" in signature(law).parameters
+
+
+def _conducts(m: Skeleton) -> bool:
+    """Return whether fluid may flow in a material."""
+    return bool(m.conductivity_law or callable(m.conductivity) or np.any(np.asarray(m.conductivity) > 0))
+
+
+def _layered(materials: Sequence[Skeleton]) -> bool:
+    """Return whether the conductivity of materials depends on position, or follows more than one law."""
+    laws = {m.conductivity_law for m in materials}
+    by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, laws - {None}))
+    return by_place or len(laws) > 1 or len({m.retention for m in materials}) > 1
+
+
+def _samples(materials: dict[int, Skeleton]) -> dict[str, int | list[float]]:
+    """Return samples of the conductivity laws and retention curves of materials, by name.  Keys: their indices."""
+    out: dict[str, int | list[float]] = {}
+    for i, m in materials.items():
+        if m.conductivity_law:
+            out[f"conductivity law of material {i}"] = sampled(m.conductivity_law)
+        if m.retention is not None:
+            out[f"retention of material {i}"] = drained(m.retention)
+    return out
 
 
 def _takes(law: type[Skeleton]) -> list[str]:

@@ -110,6 +110,51 @@ def begin_stage(
     fields: Mapping[str, ArrayLike],
 ) -> State:
     """Return the state at the beginning of a stage with the new conditions `named`, see `Simulation.stage`."""
+    flag("stage: reset_displacement", reset_displacement)
+    before, after = state.stage, _stage_after(scene, state, named, add, remove)
+    quiet = {name: one for name, one in after.of(Quiet).items() if name not in after.same(before)}
+    if quiet and before.inertia:
+        raise ValueError(f"{next(iter(quiet))}: must act from the first stage in which its bodies have inertia")
+    state, tractions = _released(scene, state, after, quiet) if quiet else (state, {})
+    scene.rests_at(before, state.t)
+    state = scene.followed(state)
+    if state.stays:  # points have the pressures of cells, not of pieces
+        state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    starts_moving = after.inertia and not before.inertia
+    rests = starts_moving and (not state.begins or state.held is not None)
+    state, supported = replace(state, stay=None), _holds_as(after, before)
+    if rests and supported and not scene.momentum.own.rates:
+        state = _kept_at_rest(scene, state)
+    else:
+        state = replace(state, held=None)
+    removed = _points_of(scene, state.points, remove)
+    points, new = _joined(scene, state, after, add, remove, fields)
+    ended = before.data_names(before.named.keys() - after.same(before))
+    points = _gripped(scene, after, points, _without_data(state.points, ended))
+    points = _changed(scene, _with_tractions(points, tractions), fields)
+    if starts_moving:
+        points = replace(points, data=points.data | resting(points))
+    if reset_displacement:
+        points = replace(points, origin=points.corners)
+    pieces = state.pieces
+    if pieces is not None:
+        pieces = pieces.of(removed, kept=False).joined(at_start(new))
+    return replace(
+        state,
+        points=points,
+        pieces=pieces,
+        stage=after,
+        begins=True,
+        outcome=after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0),
+        rest=state.rest if supported else None,
+        trend=None if add or remove else state.trend,
+    )
+
+
+def _stage_after(
+    scene: Scene, state: State, named: Mapping[str, Any], add: Sequence[int], remove: Sequence[int]
+) -> Stage:
+    """Return the stage that follows the stage of a state, checked.  Parameters: see `Simulation.stage`."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene has none, must be created with gravity=(0, 0)")
@@ -119,7 +164,6 @@ def begin_stage(
             raise ValueError("stage: inertia: the scene has none, must be created with inertia=False")
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are still to be added")
-    flag("stage: reset_displacement", reset_displacement)
     present = [(is_present and body not in remove) or body in add for body, is_present in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
@@ -133,50 +177,39 @@ def begin_stage(
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
         _warn_moved_on(scene, before, after)
-    new_quiet = {name: one for name, one in after.of(Quiet).items() if name not in after.same(before)}
-    if new_quiet and before.inertia:
-        raise ValueError(f"{next(iter(new_quiet))}: must act from the first stage in which its bodies have inertia")
-    state, tractions = _released(scene, state, after, new_quiet) if new_quiet else (state, {})
-    scene.rests_at(before, state.t)
-    state = scene.followed(state)
-    if state.stays:  # points have the pressures of cells, not of pieces
-        state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
-    rests = after.inertia and not before.inertia and (not state.begins or state.held is not None)
-    state, supported = replace(state, stay=None), _holds_as(after, before)
-    if rests and supported and not scene.momentum.own.rates:
-        state = _kept_at_rest(scene, state)
-    else:
-        state = replace(state, held=None)
-    own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
-    removed, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
-    standing = [body for body, is_present in enumerate(before.present) if is_present and body not in remove]
-    bare, gravity = _without_data(state.points, before.data_names(before.named)), None
-    if scene.initial.given:
-        gravity = after.gravity_at(state.t)
+    return after
+
+
+def _points_of(scene: Scene, points: MaterialPoints, bodies: Sequence[int]) -> NDArray[np.int64]:
+    """Return the ids of the points of bodies, which are given by index."""
+    return points.id[np.isin(body_of(points.id, np.cumsum([0, *map(len, scene.bodies)])), list(bodies))]
+
+
+def _joined(
+    scene: Scene, state: State, after: Stage, add: Sequence[int], remove: Sequence[int], fields: Mapping[str, ArrayLike]
+) -> tuple[MaterialPoints, MaterialPoints]:
+    """Return all points of the next stage, without the data of conditions, and the points of added bodies alone."""
+    before = state.stage
+    bare = _without_data(state.points, before.data_names(before.named))
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
         what = f"stage: add: body {add[0]} after a renewal of domains"
         raise ValueError(f"{what}, must be added before the first renewal, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
-    points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
-    others = before.data_names(before.named.keys() - after.same(before))
-    points = _gripped(scene, after, points, _without_data(state.points, others))
+    bare = bare.of(_points_of(scene, bare, remove), kept=False)
+    standing = [body for body, is_present in enumerate(before.present) if is_present and body not in remove]
+    return _filled(scene, bare, standing, add, after.gravity_at(state.t) if scene.initial.given else None)
+
+
+def _with_tractions(
+    points: MaterialPoints, tractions: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
+) -> MaterialPoints:
+    """Return the points with the tractions of quiet sides, which are results of `_released`."""
+    data = dict(points.data)
     for name, (ids, values) in tractions.items():
         known, at = points.find(ids)
-        rows = points.data[name].copy()
-        rows[at] = values[known]
-        points = replace(points, data=points.data | {name: rows})
-    if pieces is not None:
-        pieces = pieces.of(removed, kept=False).joined(at_start(new))
-    points = _changed(scene, points, fields)
-    if after.inertia and not before.inertia:
-        points = replace(points, data=points.data | resting(points))
-    if reset_displacement:
-        points = replace(points, origin=points.corners)
-    outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
-    rest = state.rest if supported else None
-    new = {"stage": after, "begins": True, "outcome": outcome, "rest": rest}
-    new["trend"] = None if add or remove else state.trend
-    return replace(state, points=points, pieces=pieces, **new)
+        data[name] = data[name].copy()
+        data[name][at] = values[known]
+    return replace(points, data=data)
 
 
 def next_stage(
