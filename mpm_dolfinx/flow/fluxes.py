@@ -388,6 +388,48 @@ class HalfFaces:
         return sum_by(self.at, values, len(self.contents.filled))
 
 
+class Face:
+    """Geometry of a face between two active cells as UFL.  The normal points from the first cell "+" to the second.
+
+    `centroid` (d,), m: centroid of the material in each cell, relative to the centre of the cell.
+    `lower`, `upper` (d,): fractions of the lower and upper faces of each cell that material covers.  In axisymmetry
+    they include the circumference.
+    """
+
+    def __init__(self, grid: Grid, centroid: fem.Function, lower: fem.Function, upper: fem.Function):
+        self.normal = n = ufl.FacetNormal(grid.mesh)("+")
+        h0, h1, self.across = across_faces(grid, n)
+        self.edges = h0, h1
+        """Edge lengths, in m, of both cells along the normal."""
+        self.distances = h0 / 2 - ufl.dot(centroid("+"), n), h1 / 2 + ufl.dot(centroid("-"), n)
+        """Distances, in m, from the centroids to the face."""
+        off = ufl.jump(centroid)
+        self.lateral = off - ufl.dot(off, n) * n
+        """Difference of the two centroids in the plane of the face, in m."""
+
+        def covered(side: str, sign: int):
+            """Return the fraction of the face that the material of one cell covers."""
+            return sum(
+                ufl.conditional(ufl.gt(sign * n[a], 0.5), upper(side)[a], 0.0)
+                + ufl.conditional(ufl.lt(sign * n[a], -0.5), lower(side)[a], 0.0)
+                for a in range(grid.dim)
+            )
+
+        self.share = ufl.min_value(covered("+", 1), covered("-", -1))
+        """Fraction of the face that the material of both cells covers."""
+        h = grid.edge_in_forms()("+")
+        self.volume = prod(h[a] for a in range(grid.dim))  # divided by h0, this is the area of the face on both sides
+
+    def mean(self, force: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
+        """Return the mean of an inertia force over two cells, as for the mass: weights 1/6, 2/3, 1/6 of three nodes.
+
+        With the value at the face, freely flowing water would have more mass than all of the soil in modes that
+        alternate between nodes.
+        """
+        (h0, h1), of = self.edges, [ufl.dot(ufl.grad(force)(side), self.normal) for side in "+-"]
+        return ufl.avg(force) - (h0**2 * of[0] - h1**2 * of[1]) / (3 * (h0 + h1))
+
+
 class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
@@ -420,66 +462,51 @@ class FluxForms:
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
         vectors = (fem.Function(grid.cellwise((d,))) for _ in range(6))
         self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face, self.slope = vectors
-        n0 = ufl.FacetNormal(mesh)("+")
-        h0, h1, across = across_faces(grid, n0)
-
-        def opening(side, sign):
-            """Return the fraction of a face that material covers, in axisymmetry times the circumference."""
-            lower, upper = self.lower_face(side), self.upper_face(side)
-            return sum(
-                ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
-                + ufl.conditional(ufl.lt(sign * n0[a], -0.5), lower[a], 0.0)
-                for a in range(d)
-            )
-
-        share = ufl.min_value(opening("+", 1), opening("-", -1))
-        d0 = h0 / 2 - ufl.dot(self.centroid("+"), n0)
-        d1 = h1 / 2 + ufl.dot(self.centroid("-"), n0)
-        k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
-        offset = across * n0 - ufl.jump(self.centroid + self.moved)
+        face = Face(grid, self.centroid, self.lower_face, self.upper_face)
+        n = face.normal
+        d0, d1 = face.distances
+        k0, k1 = (sum(abs(n[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
+        offset = face.across * n - ufl.jump(self.centroid + self.moved)
+        by_motion = None
         if inertial is not None:
-            # mean over two cells as for the mass: weights 1/6, 2/3, 1/6 of three nodes in a row.  With the value at the
-            # face, freely flowing water would have more mass than all of the soil in modes that alternate between nodes
             moved, force = inertial
-            along_n = [ufl.dot(ufl.grad(force)(side), n0) for side in "+-"]
-            along = ufl.avg(force) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
-            weight = along if weight is None else weight + along
-            by_motion = ufl.derivative(along, moved, ufl.TrialFunction(moved.function_space))
+            inertia = face.mean(force)
+            weight = inertia if weight is None else weight + inertia
+            by_motion = ufl.derivative(inertia, moved, ufl.TrialFunction(moved.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
-        off = ufl.jump(self.centroid)
         slope = ufl.avg(self.slope)
         if relative is not None:  # nearly empty cells, whose pressures vary most, have small weights
             slope = ufl.avg(self.fixed_stress * self.slope) / (ufl.avg(self.fixed_stress) + TINY)
-        lateral = ufl.dot(slope, off - ufl.dot(off, n0) * n0)
+        lateral = ufl.dot(slope, face.lateral)
+        between = []
         if relative is not None:
             drop = drop - lateral
             between = relative.between(pressure, drop)
             k0, k1 = (k * relative.conducts(side, [one.k for one in between]) for k, side in ((k0, "+"), (k1, "-")))
         resistance = d0 * k1 + d1 * k0 + TINY
-        T = share * k0 * k1 / resistance
+        T = face.share * k0 * k1 / resistance
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
-        self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
         self.dt = fem.Constant(mesh, 0.0)
-        damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self.dt * T, 0.0)
+        damped = ufl.max_value(ufl.avg(self.damping) * face.share * (d0 + d1) - self.dt * T, 0.0)
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
-        h = grid.edge_in_forms()("+")
-        volume = prod(h[a] for a in range(d))  # divided by h0, this is the area of the face on both sides
-        self.alternation = FacetForm(smaller / (4 * d) * h0 / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
+        alternating = smaller / (4 * d) * face.edges[0] / face.volume
+        self.alternation = FacetForm(alternating * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         self.density = fem.Function(Q)
         self._sum = fem.Function(Q)
-        self.nonorthogonal = None
-        if flows and not grid.axisymmetric:
+        self.flux = self.nonorthogonal = self.gravity = self.by_motion = None
+        if not flows:
+            return
+        if not grid.axisymmetric:
             self.nonorthogonal = FacetForm(-T * ufl.avg(self.density) * lateral * ufl.jump(q) * dS, grid.comm)
-        self.gravity = self.by_motion = None
-        if (weight is not None or relative is not None) and flows:
+        by_pressure = T * ufl.jump(dp)
+        if weight is not None or relative is not None:
             # still water must not flow: its pressure increases with depth by the unit weight at zero pressure.
             # Pressure and weight are in one form, so that rounding errors are small and conserve mass
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
             difference = ufl.jump(pressure) + drop
-            flux = T * density * difference * ufl.jump(q) * dS
-            self.gravity = FacetForm(flux, grid.comm)
-            if inertial is not None:
+            self.gravity = FacetForm(T * density * difference * ufl.jump(q) * dS, grid.comm)
+            if by_motion is not None:
                 conductance = T if relative is None else T * density
                 form = conductance * ufl.dot(by_motion, offset) * ufl.jump(q) * dS
                 self.by_motion = FacetForm(_compat.expanded(form), grid.comm)
@@ -488,15 +515,15 @@ class FluxForms:
                 def by_k(k):
                     """Return the derivative of the transmissibility T with respect to k, one of the values of k_r."""
                     first = d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k)
-                    return share * (first + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k))
+                    return face.share * (first + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k))
 
                 # the outflow must rise with the pressure of the cell, and fall with the neighbour's, despite rounding
                 own, other = (
                     T * sign + difference * sum(by_k(one.k) * one.slopes[side] for one in between)
                     for side, sign in enumerate((1, -1))
                 )
-                slope = ufl.max_value(own, 0.0) * dp("+") + ufl.min_value(other, 0.0) * dp("-")
-                self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
+                by_pressure = density * (ufl.max_value(own, 0.0) * dp("+") + ufl.min_value(other, 0.0) * dp("-"))
+        self.flux = FacetForm(by_pressure * ufl.jump(q) * dS, grid.comm)
 
     @property
     def gradients(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
