@@ -108,6 +108,29 @@ class Forms(NamedTuple):
     given: list[tuple[Callable[[float], ArrayLike], fem.Constant]]
 
 
+def _check_scene(grid: Grid, material: Skeleton, fluid: Fluid | None, element: str, conditions: Sequence) -> None:
+    """Raise ValueError for a scene that the reference cannot compute."""
+    begin_with("grid", grid)
+    if not grid.even:
+        raise ValueError("grid: cells of several sizes, must be equal in the reference")
+    all_of("material", [material], Skeleton)
+    all_of("fluid", [fluid] if fluid is not None else [], Fluid)
+    if element not in ELEMENTS:
+        raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
+    all_of("conditions", conditions, (Traction, Pressure, RigidPlate, Drained))
+    for outlet in (one for one in conditions if isinstance(one, Drained)):
+        if outlet.seepage:
+            raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
+        if callable(outlet.pressure):
+            raise ValueError(f"{line(outlet)}: in the reference the pressure must be a number")
+    fields = (material.porosity, material.biot, material.grain_bulk)
+    if material.state or material.unknowns or any(map(callable, fields)):
+        raise ValueError(
+            f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
+            "conductivity and parameters of the law may be functions of position, other data must be numbers"
+        )
+
+
 class BiotFEM:
     """Finite element model of a box, with its state.  Without fluid, the model describes the drained skeleton.
 
@@ -153,15 +176,8 @@ class BiotFEM:
         element: str = "taylor-hood",
         numerics: Numerics = DEFAULT,
     ):
-        begin_with("grid", grid)
-        if not grid.even:
-            raise ValueError("grid: cells of several sizes, must be equal in the reference")
-        all_of("material", [material], Skeleton)
-        all_of("fluid", [fluid] if fluid is not None else [], Fluid)
+        _check_scene(grid, material, fluid, element, conditions)
         instance("numerics", numerics, Numerics)
-        if element not in ELEMENTS:
-            raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
-        all_of("conditions", conditions, (Traction, Pressure, RigidPlate, Drained))
         tractions = [one for one in conditions if isinstance(one, (Traction, Pressure))]
         plates = [one for one in conditions if isinstance(one, RigidPlate)]
         drained = [one for one in conditions if isinstance(one, Drained)]
@@ -170,14 +186,6 @@ class BiotFEM:
         functions("sources", sources)
         if fluid is None and (drained or sources):
             raise ValueError("conditions: drained sides and sources must be given with a fluid")
-        if any(outlet.seepage for outlet in drained):
-            raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
-        fields = (material.porosity, material.biot, material.grain_bulk)
-        if material.state or material.unknowns or any(map(callable, fields)):
-            raise ValueError(
-                f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
-                "conductivity and parameters of the law may be functions of position, other data must be numbers"
-            )
         self.grid = grid
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
@@ -202,9 +210,6 @@ class BiotFEM:
             if not callable(load.value):
                 self._traction(load, 0.0)
         tractions = [*tractions, *(plate.traction(area, self._inward(plate.side)) for plate, area in self._plates)]
-        for outlet in drained:
-            if callable(outlet.pressure):
-                raise ValueError(f"{line(outlet)}: in the reference the pressure must be a number")
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
