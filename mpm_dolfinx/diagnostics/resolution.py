@@ -26,11 +26,17 @@ FULL = 1.2
 """Filled fraction of a cell above which a warning is given.  Undistorted domains below a deep footing reach 1.08."""
 
 
-def warn_overlaps(cut: CutDomains, bodies: Sequence[Body], evolves: bool) -> Callable[..., Any] | None:
+RENEWS = "; Numerics(renewal=True) replaces distorted domains"
+
+
+def warn_overlaps(
+    cut: CutDomains, bodies: Sequence[Body], evolves: bool, renewable: bool = False
+) -> Callable[..., Any] | None:
     """Warn about the fullest cell if domains overlap.  Return this function for the next check, or None if warned.
 
     `evolves`: whether soil yields.  Only then domains may be partly inverted.  Their other parts are larger than the
     domains, and overlap.
+    `renewable`: whether the warning names the renewal of domains.
     """
     grid, points = cut.grid, cut.points
     if not cut.domains:
@@ -39,17 +45,18 @@ def warn_overlaps(cut: CutDomains, bodies: Sequence[Body], evolves: bool) -> Cal
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if most <= FULL:
-        return partial(warn_overlaps, evolves=evolves)
+        return partial(warn_overlaps, evolves=evolves, renewable=renewable)
     number = over_all(grid.comm, int(grid.cell_number[cut.cells[fill.argmax()]]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
     bodies_text = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
     warn(
         grid.comm,
         ResolutionWarning,
-        "the cell at %s is filled to %.0f %%, more than it can hold: %s overlap, or are partly inverted",
+        "the cell at %s is filled to %.0f %%, more than it can hold: %s overlap, or are partly inverted%s",
         x,
         100 * most,
         bodies_text,
+        RENEWS * renewable,
     )
     return None
 

@@ -131,7 +131,8 @@ class Scene:
         self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
         # checks still to be made, which only write to the log
         mixed = [partial(warn_mixed, materials=scene)] * scene.varied
-        self._looks = (partial(warn_overlaps, evolves=scene.evolves), *mixed)
+        renewable = grid.dim == 2 and "plastic" in scene.state_names and not numerics.renewal
+        self._looks = (partial(warn_overlaps, evolves=scene.evolves, renewable=renewable), *mixed)
         self._assembled: Latest[Assembled] = Latest()
         self._on_grid: Latest[OnGrid] = Latest(self._assembled)
         self._systems: Latest[System] = Latest()
