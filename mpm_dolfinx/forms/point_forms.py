@@ -71,6 +71,8 @@ class FormPoints:
 
         None replaces the function if the caller passes the values to each assembly.
         """
+        self.chord: Callable | None = None
+        """With inertia: function of grad u, see `inertia.chord`."""
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
@@ -138,12 +140,13 @@ class FormPoints:
         return self.functions[name]
 
     def increment(self, u: fem.Function):
-        """Return I + grad u at the points, as UFL."""
+        """Return I + grad u at the points as UFL, or with inertia the F~ of `chord`."""
         if self.grid.axisymmetric and not self.grid.even:
             if "increments" not in self.live:
                 self.follow("increments", (3, 3), lambda data: data.increments(u.x.array.copy()))
             return self.functions["increments"]
-        return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
+        slope = self.grad(u) if self.grid.axisymmetric else self.gradient(u)
+        return ufl.Identity(self.grid.stretches) + (slope if self.chord is None else self.chord(slope)[0])
 
     def moved_by(self, u: fem.Function):
         """Return u at the points as UFL, on a grid of unequal cells as a coefficient whose values numpy computes."""

@@ -221,7 +221,7 @@ class GivenDisplacements(Acting):
             self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], loads.share.sum(axis=1) * force + loads.kept_at_rest(at)
         force = force[:, None] * data["direction"]
-        sums = self._grid.comm.allreduce(sums_of_rows(number, force, len(self._holds)))
+        sums = over_all(self._grid.comm, sums_of_rows(number, force, len(self._holds)))
         return dict(zip(self._names, sums, strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:

@@ -38,6 +38,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
+from math import prod
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -55,7 +56,7 @@ from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
-from mpm_dolfinx.grid.grid import polynomial, sum_by
+from mpm_dolfinx.grid.grid import corner_bits, polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
@@ -139,8 +140,8 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
     return out
 
 
-def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return F~ - I and F F~^-1 for a midpoint rule in which rotations cause no strain.
+def chord(G, midpoint):
+    """Return F~ - I and F F~^-1 for a midpoint rule in which rotations cause no strain, as UFL.
 
     The deformation gradients at the start, midpoint and end of the step are F_n, F = F_n + D and F_n + 2 D.
     The mean of the right Cauchy-Green tensors at the start and at the end is F^T F + D^T D.  Laws are evaluated at F~,
@@ -150,12 +151,14 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
     P F^T is symmetric, so moments balance.
 
-    `G` (n, d, d): gradient of the displacement since the start of the step.
+    `G` (d, d): gradient of the displacement since the start of the step.
+    `midpoint`: 1 for a midpoint rule, and 0 for F~ = F.
     """
-    one, G = np.eye(G.shape[1])[:, :, None], columns(G)
+    one = ufl.Identity(G.ufl_shape[0])
     delta = one + G
-    seen = delta + 0.5 * product(inverses(delta).swapaxes(0, 1), product(G.swapaxes(0, 1), G))
-    return tuple(of.transpose(2, 0, 1) for of in (seen - one, product(delta, inverses(seen))))
+    more = G + midpoint / (2 * ufl.det(delta)) * ufl.cofac(delta) * G.T * G
+    seen = one + more
+    return more, 1 / ufl.det(seen) * delta * ufl.cofac(seen).T  # `ufl.inv` would divide each component
 
 
 class InertiaForms:
@@ -176,17 +179,11 @@ class InertiaForms:
         """Acceleration as UFL, in m/s^2."""
         self.midpoint = fem.Constant(grid.mesh, 0.0)
         """1 in a substep with a midpoint rule, and 0 in other substeps."""
-        shared: Latest[tuple[NDArray, NDArray]] = Latest()
-        for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
-            chords = shared if len(of_laws) == 1 else Latest()
-            seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
-            seen.follow("turn", (d, d), partial(self._seen, chords, 1))
+        for seen in [points, *of_laws] if not grid.axisymmetric else []:  # axisymmetric bodies: no spin
+            seen.chord = partial(chord, midpoint=self.midpoint)
         self.pieces = p = FormPoints(grid, spread=(d, d))
         pairs = combinations_with_replacement(p.shapes(), 2)
         self._mass = CellSums([N * M + ufl.dot(g, p.spread * h) for (N, g), (M, h) in pairs], p)
-        self.moving = p = FormPoints(grid, velocity=(d,), turn=(d, d))
-        momenta = [p.velocity * N + ufl.dot(p.turn, g) for N, g in p.shapes()]
-        self._momentum = CellSums([momentum[i] for momentum in momenta for i in range(d)], p)
         self.density = fem.Function(grid.cellwise())
         """Density of the material in the cells, in kg/m^3."""
         self.work = fem.Function(V)
@@ -207,16 +204,6 @@ class InertiaForms:
         """Return accelerations, in m/s^2, at positions in cells.  `values`: shape functions at these positions."""
         nodal = self.moved.x.array.reshape(-1, self.grid.dim)[self.grid.cell_nodes[cells]]
         return self._rate.value * (values[:, :, None] * nodal).sum(axis=1)
-
-    def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return a result of `chord`: the first for `which` = 0, the second for `which` = 1.  `chords`: a cache."""
-        d = self.grid.dim
-        if which and not self.midpoint.value:
-            return np.broadcast_to(np.eye(d).ravel(), (len(data.cells), d * d))
-        G = data.gradients(self._u.x.array)
-        if self.midpoint.value:
-            return columns(chords(G, lambda: chord(G.reshape(-1, d, d)))[which]).reshape(d * d, -1).T
-        return G
 
     def on(
         self,
@@ -284,18 +271,12 @@ class Mass:
         self._forms, self._cut, self._pieces, self.unknowns = forms, cut, pieces, unknowns
         self.M, self.ghost = M, ghost
         self._held, self._held_ghost = held, held_ghost
-        self._work, self._stiffness = (unknowns.vector(), unknowns.vector()), Latest()
+        self._stiffness = Latest()
         self._solver = ksp = PETSc.KSP().create(unknowns.comm)
         ksp.setType(PETSc.KSP.Type.CG)
-        ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+        kinds = PETSc.PC.Type  # the same preconditioner; the faster one is for one process
+        ksp.getPC().setType(kinds.EISENSTAT if ksp.comm.size == 1 else kinds.SOR)
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0, divtol=np.inf)
-
-    def forces(self, u: NDArray[np.float64], flight: PETSc.Vec, rate: float) -> PETSc.Vec:
-        """Return the inertia forces at u, in N.  The next call overwrites the vector."""
-        moved, forces = self._work
-        self.unknowns.gather(u, moved).axpy(-1.0, flight)
-        self.stiffness(rate).mult(moved, forces)
-        return forces
 
     def held_forces(self, moved: PETSc.Vec, rate: float) -> PETSc.Vec:
         """Return the inertia forces, in N, at fixed nodes.  `moved`, in m: displacement minus the predictor."""
@@ -310,16 +291,20 @@ class Mass:
 
         `rate`, in 1/s^2: see `Inertia`.
         """
-        cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
-        (off, second), of = self._moments, cut.pieces.point
-        L = columns(velocity_gradients(points)).take(of, axis=2)
-        v = points.data[VELOCITY][of] + (L * off).sum(axis=1).T
-        turn = product(L, second).transpose(2, 0, 1)
-        fields = {"velocity": cut.pieces_to_cells(v), "turn": cut.pieces_to_cells(turn)}
-        b[:], (dofs, at) = 0.0, pieces.places.dofs
-        sums = forms._momentum(PointData(forms.moving, pieces.places, pieces.volume, fields))
-        b[dofs] = sum_by(at, sums.ravel(), len(dofs))
-        rhs = self.unknowns.gather(sum_ghosts(forms.work), self.unknowns.vector())
+        cut, grid, places, (off, second) = self._cut, self._forms.grid, self._pieces.places, self._moments
+        L = columns(velocity_gradients(points)).take(cut.pieces.point, axis=2)
+        v = points.data[VELOCITY][cut.pieces.point].T + product(L, off[:, None])[:, 0]
+        sent = (cut.pieces_to_cells(np.moveaxis(values, -1, 0)) for values in (v, product(L, second)))
+        v, turn = (self._pieces.volume * np.moveaxis(of, 0, -1) for of in sent)
+        y, moments = places.offset.T, []
+        for bits in corner_bits(grid.dim):
+            axes = bits.nonzero()[0]
+            terms = (prod(y[b] for b in axes if b != a) * turn[:, a] for a in axes)
+            moments.append(places.total(sum(terms, prod(y[a] for a in axes) * v)))
+        of_cells = grid.monomials.T @ grid.over_edges(np.stack(moments, axis=1), places.filled)
+        b = self._forms.work.x.array
+        b[:] = np.bincount(places.nodal.ravel(), of_cells.ravel(), len(b))
+        rhs = self.unknowns.gather(sum_ghosts(self._forms.work), self.unknowns.vector())
         out = self.unknowns.vector()
         rate = max(rate, self._least_rate)
         rhs.scale(rate)
@@ -339,7 +324,7 @@ class Mass:
         return max(size, NEAR * whole)
 
     def carried(
-        self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], rate: float, moved: NDArray[np.float64]
+        self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], rate: float, moved: NDArray | None
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data `VELOCITY` and `RATE` after a step.
 
@@ -350,11 +335,11 @@ class Mass:
         `points`: material points at the start of the step.
         `velocities`: velocities of the unknowns, in m/s, at the start and at the end of the step.
         `rate`, in 1/s^2: see `Inertia`.
-        `moved` (n,): motion of the points in the step, in cell sizes.
+        `moved` (n,): motion of the points in the step, in cell sizes.  None: all points keep their pieces.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
-        if self._forms.grid.comm.allreduce(int(moved.any())):
+        if moved is not None:
             k = -np.expm1(-RELAXES * moved)
             rest = replace(points, data=points.data | self._unseen(points, start))
             for name, values in self._unseen(rest, self.velocity(rest, rate)).items():
@@ -445,7 +430,7 @@ class Inertia(Loads):
 
     def inertia(self, at: At) -> PETSc.Vec:
         """Return the inertia forces at u, in N."""
-        return self._mass.forces(at.u, self._flight, self.rate)
+        return self._mass.stiffness(self.rate) * self._moved(at)
 
     @cached_property
     def rounding_at_unknowns(self) -> NDArray[np.float64]:

@@ -63,7 +63,7 @@ class Start(NamedTuple):
         before = earlier or [None] * len(acting.loads)
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
-    def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
+    def carrying(self, flight: Flight | None) -> Callable[[NDArray | None], dict[str, NDArray]] | None:
         """Return the argument `carried` of `Motion.advanced`, or None without inertia."""
         if flight is None:
             return None
