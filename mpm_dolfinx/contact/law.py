@@ -131,10 +131,6 @@ class ContactLaw:
         none, zero = np.zeros(k, dtype=bool), np.zeros((k, d))
         return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
 
-    def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (k, ...) of values (m, ...) over the pairs of each condition."""
-        return sums_of_rows(self.of, values, len(self.area))
-
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the area-weighted means (k, ...) of values (m, ...) over the pairs of each condition."""
         return means_of_rows(self.of, self.pairs.area, values, len(self.area))
@@ -151,8 +147,12 @@ class ContactLaw:
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
         rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         touches = (push > 0) | (at.gap - self._sunk <= rounding)
-        pressure = self.mean(push)
         on = np.zeros(len(self.area), dtype=bool)
+        if not touches.any():
+            grip = np.zeros((len(on), self.grid.dim, self.grid.dim))
+            none, rows = grip[:, 0, 0], grip[:, 0]
+            return Touch(push[:, None] * at.n, push, push, none, on, rows, rows, none, grip, rows)
+        pressure = self.mean(push)
         normal = self.mean(at.n)
         on[self.of[touches]] = True
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
@@ -246,7 +246,8 @@ class ContactLaw:
         """
         # penetrations count by volume, because small parts of faces follow their neighbours
         x = self.pairs.x
-        plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
+        plane = self.pairs.area / np.maximum(self.grid.around(x), TINY)  # both are 0 on the axis
+        plane = sum_by(self.of, plane, len(self.area))
         whole = np.minimum(1.0, plane / self.grid.smallest_faces(self.cell))
         # with inertia the allowed penetration decreases as the stiffness increases
         stiffness = self.mean(state.updates[self.of, 0] * self._modulus)

@@ -147,7 +147,7 @@ class MovedTools(ContactProblem):
         """See `ContactProblem`.  `Found.equation` is the equation of motion of the tools."""
         found = super()._find_at(w, motion)
         equation = self._equation(found)
-        pulled = self._pulled(found, equation.shift)
+        pulled = self._pulled(found, equation.shift) if found.acts else 0.0
         return found._replace(equation=equation, balanced=found.touch.force + pulled)
 
     def _carried(self, found: Found, q: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -211,14 +211,16 @@ class MovedTools(ContactProblem):
         law, d = self.now.law, self.grid.dim
         mass, guides, *_ = self._moved
         motions = guides.transpose(2, 0, 1)
-        columns = [self._onto(found, self._pulled(found, q)) for q in motions]
-        force = found.touch.force
-        onto = self._onto(found, force)
-        unknown = (law.rounding(self.now.state) * (found.touch.stiff > 0))[:, None]
-        size, least = self._sizes(found, np.abs(force)), self._sizes(found, np.broadcast_to(unknown, force.shape))
-        rows = np.stack([onto, size, least, *columns], axis=2)  # empty on processes without contact
-        touches = np.repeat((found.touch.push > 0)[:, None, None], len(motions), axis=1)
-        sums = law.by_contact(np.concatenate([rows, touches], axis=2))
+        sums = np.zeros((*mass.shape, 4 + len(motions)))
+        if found.acts:
+            columns = [self._onto(found, self._pulled(found, q)) for q in motions]
+            force = found.touch.force
+            onto = self._onto(found, force)
+            unknown = (law.rounding(self.now.state) * (found.touch.stiff > 0))[:, None]
+            size, least = self._sizes(found, np.abs(force)), self._sizes(found, np.broadcast_to(unknown, force.shape))
+            rows = np.stack([onto, size, least, *columns], axis=2)  # empty on processes without contact
+            touches = np.repeat((found.touch.push > 0)[:, None, None], len(motions), axis=1)
+            sums = law.by_contact(np.concatenate([rows, touches], axis=2))
         S = sums[:, :, 3:-1]
         if d == 2:  # the lever arm changes as the tool moves
             S[:, d, :d] += np.einsum("kij,ki->kj", guides[:, :d, :d], across(sums[:, :d, 0]))
@@ -244,12 +246,12 @@ class MovedTools(ContactProblem):
             shift[seeks] = (np.minimum(self._bearing_displacement(found), self.grid.least)[:, None] * e)[seeks]
         return MotionEquation(inverse, off, share * self._moves, shift, slides)
 
-    def coupling(self, at: At) -> PETSc.Mat:
+    def coupling(self, at: At) -> PETSc.Mat | None:
         """See `Loads`."""
         K = super().coupling(at)
         found = self.found(at)
         inverse = found.equation.inverse
-        for k in np.flatnonzero(self._moves):
+        for k in np.flatnonzero(self._moves) if found.acts else ():
             on = (np.arange(len(inverse)) == k)[:, None]
             for e, to in zip(np.eye(inverse.shape[1]), inverse[k].T, strict=True):
                 if to.any():
@@ -262,8 +264,10 @@ class MovedTools(ContactProblem):
     def settle(self, at: At, sticks: bool) -> bool:
         """See `Loads`."""
         found = self.found(at)
-        changed = super().settle(at, sticks)
-        self.now = self.now._replace(linear=self._find_at(found.w, found.motion))
+        before, changed = self.now.state, super().settle(at, sticks)
+        same = self.now.state is before
+        self.now = self.now._replace(linear=found if same else self._find_at(found.w, found.motion))
+        self._found((self.now, at.unknowns, at.u[at.unknowns.owned]), lambda: self.now.linear, self.grid.comm)
         return changed
 
     def augment(self, at: At) -> bool:

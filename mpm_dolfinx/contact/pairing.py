@@ -85,13 +85,14 @@ class Contacts(Touching):
             for sign, (own, other) in ((1, both), (-1, both[::-1])):
                 if not len(own) * len(other) or self._rank[own.id].min() < self._rank[other.id].max():
                     self._faces.append((number, own, other, sign))
-        self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
+        self._found: Latest[tuple[list[tuple[Facets, Pairs]], bool]] = Latest()
         self._cell_pairs: Latest[NDArray[np.int64]] = Latest()
 
     def placed(self, place: Place) -> Loads:
         """Return the contact loads between groups in a substep."""
         cut, points = place.cut, place.points
-        found = self._found(cut.key, lambda: self._opposite_all(cut, cut.points), self.grid.comm)
+        of = cut.points
+        found, apart = self._found(cut.key, lambda: (self._opposite_all(cut, of), self._apart(of)), self.grid.comm)
         cell_pairs = partial(self._cell_pairs, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
 
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
@@ -99,8 +100,17 @@ class Contacts(Touching):
             present = replace(points, corners=points.corners + moved)
             return self._law(place, self._opposite_all(cut, present), present, present, cell_pairs)
 
-        first_law = self._law(place, found, cut.points, points, cell_pairs)
-        return ContactLoads(self, cut, *first_law, again, cell_pairs)
+        first_law = self._law(place, found, of, points, cell_pairs)
+        return ContactLoads(self, cut, *first_law, None if apart else again, cell_pairs)
+
+    def _apart(self, points: MaterialPoints) -> bool:
+        """Return whether all groups are so far apart that none can touch in a step, see `check_end`."""
+        comm, copy = self.grid.comm, self.grid.copy(points.id)
+        groups = [points.corners[copy == k * self.grid.cells] for k in range(self.grid.copies)]
+        low = over_all(comm, np.array([of.min(axis=(0, 1), initial=np.inf) for of in groups]), MPI.MIN)
+        high = over_all(comm, np.array([of.max(axis=(0, 1), initial=-np.inf) for of in groups]), MPI.MAX)
+        gaps = (low[:, None] - high).max(axis=2)
+        return bool((np.maximum(gaps, gaps.T)[np.triu_indices(len(low), 1)] > REACH * self.grid.most).all())
 
     def _law(
         self,
@@ -236,14 +246,15 @@ class Contacts(Touching):
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
         """For each corner (n, 2^d), return whether it is within `BESIDE` cells of another group after the step."""
         present = replace(points, corners=corners)
-        out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
-        largest = np.broadcast_to(largest, corners.shape[:2])
+        out, far = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.most
         for _, *pair, _ in self._faces:
             for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, present).x
-                rows = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
-                distance, _ = cKDTree(x).query(corners[rows], distance_upper_bound=BESIDE * self.grid.most)
-                out[rows] |= distance < largest[rows]
+                low, high = x.min(axis=0, initial=np.inf) - far, x.max(axis=0, initial=-np.inf) + far
+                own_rows = self.grid.copy(points.id) == self.grid.copy(own.id[:1])
+                at = np.nonzero(own_rows[:, None] & ((low <= corners) & (corners <= high)).all(axis=2))
+                distance, _ = cKDTree(x).query(corners[at], distance_upper_bound=far)
+                out[at] |= distance < BESIDE * self.grid.sizes_at(corners[at]).max(axis=-1)
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:

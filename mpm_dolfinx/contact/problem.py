@@ -39,6 +39,7 @@ class Found(NamedTuple):
     touch: Touch  # forces of the pairs
     motion: NDArray[np.float64]  # motions of tools that forces cause (k, q), m and rad
     balanced: NDArray[np.float64]  # forces on points after the Newton increment of the tools (m, d), N
+    acts: bool  # whether any pair of any process is in contact, or was in contact in this substep
     equation: Any = None  # equation of motion of tools that forces move, see `moved_tools`
 
 
@@ -158,10 +159,11 @@ class ContactProblem(Loads):
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         """Return geometry and forces at relative displacements w and given motions of the tools."""
-        law = self.now.law
+        law, state = self.now.law, self.now.state
         at = law.pairs.at(w, motion)
-        touch = law.touch(self.now.state, at)
-        return Found(w, at, touch, motion, touch.force)
+        touch = law.touch(state, at)
+        some = any(of.any() for of in (touch.stiff, state.pressure, state.slip, state.stuck))
+        return Found(w, at, touch, motion, touch.force, over_all(self.grid.comm, int(some)) > 0)
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the motions (k, q) of tools that the contact forces cause at relative displacements w of the pairs."""
@@ -175,8 +177,10 @@ class ContactProblem(Loads):
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Subtract the contact forces at u from the residual."""
+        if not (found := self.found(at)).acts:
+            return
         B, w = self._B(self.now.law, at.unknowns)
-        w.array_w[:] = -self.found(at).balanced.ravel()
+        w.array_w[:] = -found.balanced.ravel()
         B = B if on is at.unknowns else self.pairs.operator(on)
         B.multTransposeAdd(w, residual, residual)
 
@@ -210,10 +214,12 @@ class ContactProblem(Loads):
         B = at_nodes(grid, unknowns, grid.locals[cell], np.ones((m, 2 ** (d + 1))), other)
         return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
-    def coupling(self, at: At) -> PETSc.Mat:
+    def coupling(self, at: At) -> PETSc.Mat | None:
         """Return minus the derivative of the contact forces with respect to the nodal displacements, at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, matrices of 12 cells fill 60 MB in each iteration
         found, law = self.found(at), self.now.law
+        if not found.acts:
+            return None
         B, _ = self._B(law, at.unknowns)
         return petsc_matrix(law.tangent(found.touch, found.at), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
 
@@ -227,7 +233,7 @@ class ContactProblem(Loads):
 
     def settle(self, at: At, sticks: bool) -> bool:
         """See `Loads`.  Each contact may change between stick and slip in each cell."""
-        if not self.now.law.frictional:
+        if not (self.now.law.frictional and self.found(at).acts):
             return False
         state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
         self.now = self.now._replace(state=state)
@@ -236,6 +242,8 @@ class ContactProblem(Loads):
     def augment(self, at: At) -> bool:
         """Augment the pressures where mean penetrations exceed `DEPTH` cells.  Return whether forces changed."""
         law, state = self.now.law, self.now.state
+        if not self.found(at).acts:
+            return False
         part = at.parts.cells[law.cell]
         new = law.augmented(state, self.found(at).touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -28,8 +29,8 @@ class Pose(NamedTuple):
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert current positions x (m, d) to positions in the frame of the tool."""
-        y = x - self.shift
-        return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
+        y, turn = x - self.shift, self.R - np.eye(len(self.R))
+        return y + (y - self.centre) @ turn if turn.any() else y
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert positions y (m, d) in the frame of the tool to current positions."""
@@ -213,7 +214,12 @@ class Tool:
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
         """Return the value of an attribute at time t, in s.  A vector has `dim` components."""
-        return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
+        return given(f"{self._title}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
+
+    @cached_property
+    def _title(self) -> str:
+        """Representation of the tool in one line, for messages."""
+        return line(self)
 
     def along(self, dim: int) -> NDArray[np.float64]:
         """Return the unit vector (d,) along `direction`, or zero without a direction."""

@@ -352,9 +352,11 @@ class Tools(Touching):
                 continue
             before, tips = (self._pose(tool, t).put(tool.solid(grid.least).places) for t in (place.start, place.t))
             at = self._cells(tips)
-            x, area = patches.now(points), patches.area(points)
+            x = patches.now(points)
             near = ((self._cells(x) > at.min(axis=0) - 1) & (self._cells(x) < at.max(axis=0) + 1)).all(axis=1)
-            x, area = x[near], area[near]
+            if not over_all(grid.comm, int(near.any())):
+                continue
+            x, area = x[near], patches.area(points)[near]
             pairs = cKDTree(at).sparse_distance_matrix(cKDTree(self._cells(x)), 1.0, output_type="ndarray")
             tip, face = pairs["i"], pairs["j"]
             n, depth = np.zeros_like(tips), np.full(len(tips), np.inf)
@@ -384,15 +386,24 @@ class Tools(Touching):
 
     def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise an error if a tool contains points, touches prescribed sides, or has crossed a body in the step."""
-        t = place.t
-        x, start = (of.within() for of in (points, before))
+        t, comm = place.t, self.grid.comm
+        ends = [middle(of.corners) for of in (before, points)]
+        off = [of.corners - x[:, None] for of, x in zip((before, points), ends, strict=True)]
+        sizes = sum(np.sqrt(np.einsum("nkd,nkd->n", of, of)) for of in off)  # at least the distances to the corners
         for tool in self.tools:
             for hold, faces in self._held:
                 deep, where = self._deepest(tool, place.cut.surface(faces).now(points), t)
                 if deep > MISFIT:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must be apart; limit the displacement by a region, or move the tool")
-            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -MISFIT * self.grid.least]
+            y, end = (self._pose(tool, at).own(x) for at, x in zip((place.start, t), ends, strict=True))
+            gap = together(comm, partial(tool.gap, end, self.grid.least))  # changes by at most the distance
+            near = (gap <= sizes + np.linalg.norm(end - y, axis=1)) | callable(tool.shape)
+            if not over_all(comm, int(near.any())):
+                continue
+            x, start = (of.within()[near] for of in (points, before))
+            corners = points.corners[near]
+            corners = corners[self._gaps(tool, corners, t).min(axis=1) < -MISFIT * self.grid.least]
             deep, where = self._deepest(tool, x, t)
             held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool may contain the middle of a long domain, but no corner
