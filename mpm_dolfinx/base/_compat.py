@@ -57,7 +57,7 @@ def box_mesh(
         # FFCx would add this variant itself after its first form, and so change the names of later libraries
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1, variant="equispaced"))
         ghosts = mesh.GhostMode.shared_facet
-        lists = cpp.graph.AdjacencyList_int32(*where)
+        lists, cells = cpp.graph.AdjacencyList_int32(*where), cpp.graph.AdjacencyList_int64(cells)
         return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
     domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
     lists = graph.adjacencylist(*where)

@@ -159,7 +159,8 @@ class MomentumForms:
             ratio = ufl.det(points.increment(self.u))
             P, A, beside, means = self._fbar.forms(law, points, F, seen, ratio, values, known)
         else:
-            P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
+            P = law.first_piola(F, known)
+            A = ufl.diff(P if known is values else law.first_piola(F, values), F)
         slopes = []
         if p is not None:
             stresses = self._fbar.stresses(law, F, seen, values) if locks else [law.first_piola(F, values)]
