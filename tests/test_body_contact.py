@@ -8,6 +8,7 @@ import pytest
 from layers import compliance, errors
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.contact.pairing import Contacts
 
 E = 1e6  # Pa
 SOIL = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-6)  # nu = 0
@@ -53,6 +54,14 @@ def two_blocks(
 def pressed_by(depth, height):
     """Return the stress of a body between walls after a compression by a depth."""
     return E * np.log(1 - depth / height) / (1 - depth / height)
+
+
+@pytest.mark.parametrize(("cells", "apart"), [(1.9, False), (2.1, True)])
+def test_groups_within_reach_of_a_step_are_paired_again(cells, apart):
+    """A step moves groups by at most two cells towards each other."""
+    s = two_blocks(gap=cells / 8)
+    (contacts,) = (one for one in s.state.stage.acting if isinstance(one, Contacts))
+    assert contacts._apart(s.points) is apart
 
 
 @pytest.mark.parametrize(("dim", "offset", "order"), [(2, 0.0, 1), (2, 0.37, -1), (2, 0.98, 1), (3, 0.37, 1)])
