@@ -243,3 +243,23 @@ BAD = {
 @pytest.mark.parametrize(("make", "name", "value"), BAD.values(), ids=BAD)
 def test_bad_functions_are_refused_in_one_line(make, name, value, tmp_path):
     refused_in_one_line(make, name, value, tmp_path, 400)
+
+
+@pytest.mark.parametrize("condition", [mpm.Inflow("top", 1e-4), mpm.Rain("top", 1e-4)], ids=["inflow", "rain"])
+@pytest.mark.parametrize("axisymmetric", [False, True])
+def test_a_flux_per_current_area_grows_with_a_side_that_is_stretched(condition, axisymmetric):
+    """Earlier, the area at the start of each step counted: volumes were 0.9 % (1.8 %) too small in steps of 2 %."""
+    grid = mpm.Grid([0, 0], [1.6, 1.0], [16, 10], axisymmetric=axisymmetric)
+    pull = mpm.Displacement("right", lambda t: (0.2 * t, 0), "x")
+    body, soil = mpm.box(grid, [0, 0], [1, 0.53]), mpm.Hencky(bulk=2e5, shear=1e5, porosity=0.4, conductivity=1e-2)
+    conditions, walls = [pull, condition, mpm.Drained("right")], {"left": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=conditions, fluid=mpm.Fluid())
+    result = s.run(1.0, 0.1, progress=False)
+    volume = 1e-4 * (np.pi * (1.2**3 - 1) / 0.6 if axisymmetric else 1.1)
+    rate = 1e-4 * (np.pi * 1.2**2 if axisymmetric else 1.2)
+    name = next(name for name in s.outflows if name != "drained_right")
+    assert -s.outcome("flowed")[name] == pytest.approx(volume, rel=1e-3)
+    assert -s.outflows[name] == pytest.approx(rate, rel=1e-3)
+    assert result.balance < 1e-8
+    if isinstance(condition, mpm.Rain):
+        assert s.outcome("rained")[name] == pytest.approx(-s.outcome("flowed")[name], rel=1e-12)

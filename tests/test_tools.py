@@ -561,3 +561,17 @@ def test_a_tool_less_than_a_cell_wide_presses(ends):
         s.run(1.0, 0.5, progress=False)
         forces.append([*s.tool_forces.values(), *s.reactions.values()][0][1])
     assert forces[0] == pytest.approx(forces[1], rel=0.1)
+
+
+def test_adhesion_on_a_stretched_surface_is_of_first_order_in_the_step():
+    grid, clay = mpm.Grid([-0.2, -0.4], [1.6, 1.0], [18, 14]), mpm.Hencky(bulk=2e5, shear=1e5)
+    floor, pull = mpm.Tool(mpm.HalfSpace((0, 0), (0, 1)), adhesion=1e2), lambda t: (0.2 * t, 0)
+    sides = [mpm.Displacement("right", pull, "x"), mpm.Displacement("left", (0, 0), "x"), mpm.Pressure("top", 2e3)]
+    off = []
+    for steps in (5, 10):
+        body = mpm.box(grid, [0, 0], [1.0, 0.53])
+        s = mpm.Simulation(grid, [body], [clay], walls={}, conditions=[floor, *sides])
+        along, up, _ = s.run(1.0, 1 / steps, progress=False).tool_forces["tool"][-1]
+        assert up == pytest.approx(2e3 * 1.2, rel=1e-3)
+        off.append(1 + along / (1e2 * 1.2))
+    assert off == pytest.approx([0.2 / 5 / 1.2, 0.2 / 10 / 1.2], rel=2e-2)

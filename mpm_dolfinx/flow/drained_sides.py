@@ -58,6 +58,7 @@ class DrainedSides(Feeding):
         self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
         self.varies = any(callable(getattr(one, name)) for one in outlets.values() for name in one.FUNCTIONS)
         self.varies |= any(self._ponds)
+        self._gives = not all(isinstance(outlet, Drained) for outlet in outlets.values())
         for (one, faces), (other, others) in combinations(self._outlets, 2):
             faces.check_apart(others, (one, other))
         self._constant: Latest[OpenSides] = Latest()
@@ -91,10 +92,10 @@ class DrainedSides(Feeding):
     def placed(self, wet: Wet) -> SideFeeds:
         """Return the flow through the open sides in a substep."""
         if self.varies:
-            return SideFeeds(self._sides(wet), wet, self._names, self._ponds)
+            return SideFeeds(self._sides(wet), wet, self._names, self._ponds, self._gives)
         key = (wet.cut.key, wet.contents.key, wet.points)
         sides = self._constant(key, lambda: self._sides(wet), self._grid.comm)
-        return SideFeeds(sides, wet, self._names, self._ponds)
+        return SideFeeds(sides, wet, self._names, self._ponds, self._gives)
 
     def _sides(self, wet: Wet) -> OpenSides:
         grid, rows = self._grid, []
@@ -204,7 +205,8 @@ class RainedFaces(OpenFaces):
     the pressure of the pond and at the pressure `Rain.driest`.
     """
 
-    rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
+    fallen: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
+    rain: NDArray[np.float64]  # rain and inflow from ponds (m,), m^d/s; nan for faces without rain
     pond: OpenFaces  # these faces with the pressure of the pond outside
     dry: OpenFaces  # these faces with the driest pressure outside
 
@@ -242,12 +244,16 @@ class SideFeeds(Feeds):
     `wet`: data of the substep.
     `names`: names of the conditions.
     `ponds`, m: largest depth of the pond of each condition, or None without rain.
+    `gives`: whether a condition prescribes a flux.
     """
 
-    def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
+    def __init__(
+        self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...], gives: bool
+    ):
         self._names, self._before = names, wet.outcome
         self._at, self._comm = wet.contents.slot(sides.cells), wet.cut.grid.comm
         self._ponds, self._fallen = ponds, sides.rain
+        self._gives = gives
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
         self.settles = bool(np.logical_or.reduce(self._seeps))
@@ -278,6 +284,9 @@ class SideFeeds(Feeds):
     def conducting(self, flow: Conduction, driest: NDArray[np.float64] | None = None) -> OpenFaces:
         """Return the faces with their conductances.  `driest` (m,), Pa: replaces `sides.pressure`."""
         at, sides = self._at, self.sides if driest is None else replace(self.sides, pressure=driest)
+        if self._gives:
+            stretch = flow.stretch(at, sides.normal)
+            sides = replace(sides, given=sides.given * stretch)
         (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
         faces = OpenFaces(at, conductance, inflow, self._seeps, offset)
         if flow.relative is not None:
@@ -287,7 +296,9 @@ class SideFeeds(Feeds):
         if self.linear or driest is not None:
             return faces
         dry = self.conducting(flow, np.where(np.isnan(sides.driest), sides.pressure, sides.driest))
-        return RainedFaces(at, conductance, faces.inflow, self._seeps, offset, sides.rain, faces, dry)
+        fallen = self._fallen * stretch
+        rain = fallen + (sides.rain - self._fallen)  # the volume of a pond does not depend on its area
+        return RainedFaces(at, conductance, faces.inflow, self._seeps, offset, fallen, rain, faces, dry)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """See `Feeds`.  Seepage faces with an outflow are opened."""
@@ -325,8 +336,8 @@ class SideFeeds(Feeds):
         """
         rows = through = self._through(at, fluid)
         if not self.linear:  # nan without rain
-            excess = np.maximum(self._fallen, 0.0) + np.minimum(through, 0.0)
-            rows = np.stack([through, self._fallen, excess])
+            excess = np.maximum(at.fallen, 0.0) + np.minimum(through, 0.0)
+            rows = np.stack([through, at.fallen, excess])
         sums = over_all(self._comm, sum_by(self.sides.number, rows, len(self._names)))
         if self.linear:
             return {"outflows": dict(zip(self._names, sums, strict=True))}

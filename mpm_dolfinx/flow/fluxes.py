@@ -99,6 +99,16 @@ class Conduction(NamedTuple):
         across = kappa / ratio[at] * np.add.reduce(pulled**2, axis=(1, 2))
         return across if hoop is None else across * hoop[at]
 
+    def stretch(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Return the areas (m,) of faces in cells `at`, divided by areas at the start of the step.
+
+        `normal` (m, d): normals of the faces.
+        """
+        if self.motion is None:
+            return 1.0
+        area = np.linalg.norm((self.motion.cofactors[at] @ normal[:, :, None])[:, :, 0], axis=1)
+        return area if self.motion.hoop is None else area * self.motion.hoop[at]
+
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
         """Return distances (m,) of faces from the centroid, divided by distances from the pressure position (`layers`).
 
