@@ -48,6 +48,27 @@ PLACES = {
 }
 
 
+@pytest.mark.parametrize("rate", [steps(0, 1e-6), lambda t: 1e-6 * (t > JUMP)], ids=["stepwise", "function"])
+def test_step_refuses_a_jump_within_the_step(rate):
+    """Earlier, `step` took it: rain that began within a step was counted from its start, or not in this step."""
+    s = block([mpm.Rain("top", rate)], **WET)
+    s.step(2.0)
+    with pytest.raises(ValueError, match=r"step: dt = 1\.0 s from t = 2\.0 s: .*, must be at most 0\.[45]"):
+        s.step(1.0)
+    assert s.t == 2.0
+    s.step(s.without_jump(1.0)[0])
+    s.step(1.0)
+    assert s.t == pytest.approx(3.5, rel=1e-12)
+    assert s.outcome("rained")["rain_top"] == pytest.approx(2e-6, rel=1e-9)
+
+
+def test_step_takes_a_step_that_ends_at_a_jump_up_to_rounding():
+    s = block([mpm.Rain("top", steps(0, 1e-6, at=0.3))], **WET)
+    for _ in range(5):
+        s.step(0.1)  # the third step ends at 0.30000000000000004 s
+    assert s.outcome("rained")["rain_top"] == pytest.approx(0.4e-6, rel=1e-9)
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_a_step_ends_at_the_jump_wherever_the_value_stands(place):
     """Earlier, jumps of water levels, and of the motion and the load of tools, were within a step."""

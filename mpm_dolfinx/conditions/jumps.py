@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,8 @@ class Stepwise:
 
     The value `values[k]` begins after `times[k]`, and remains until `times[k + 1]`.  The value at `times[0]` is
     `values[0]`, and the last value has no end.  Steps of `run` end at all `times`, so volumes of rain and inflow are
-    exact to rounding.  Results and factors of safety at `times[k]` belong to the value before `times[k]`.
+    exact to rounding.  `Simulation.step` refuses a jump within a step.  Results and factors of safety at `times[k]`
+    belong to the value before `times[k]`.
 
     Parameters
     ----------
@@ -68,24 +69,24 @@ class Stepwise:
         return bool(at and (self.values[k] != self.values[k - 1]).any())
 
 
-def stepwise(condition: Any) -> dict[str, Stepwise]:
-    """Return the `Stepwise` values of a condition by the name of the attribute, for example of a water level."""
-    own = getattr(condition, "__dict__", {})
-    values = {name: getattr(value, "level", value) for name, value in own.items()}
-    return {name: value for name, value in values.items() if isinstance(value, Stepwise)}
+def stepwise(conditions: Iterable[Any]) -> list[tuple[str, Stepwise]]:
+    """Return the `Stepwise` values of conditions with the name of the attribute, for example of a water level."""
+    own = [item for one in conditions for item in getattr(one, "__dict__", {}).items()]
+    values = [(name, getattr(value, "level", value)) for name, value in own]
+    return [(name, value) for name, value in values if isinstance(value, Stepwise)]
 
 
 def motions(condition: Any) -> list[Stepwise]:
     """Return the `Stepwise` displacements and rotations of a side or a tool."""
     moved = getattr(condition, "MOVED", ())
-    return [value for name, value in stepwise(condition).items() if name in moved]
+    return [value for name, value in stepwise([condition]) if name in moved]
 
 
-def functions_of_time(conditions: Iterable[Any], gravity: Any) -> list[Stepwise | Callable[[float], NDArray]]:
+def functions_of_time(conditions: Collection[Any], gravity: Any) -> list[Stepwise | Callable[[float], NDArray]]:
     """Return the functions at whose jumps steps end: each `Stepwise`, and each flux that depends on time alone."""
     out: list[Stepwise | Callable[[float], NDArray]] = [gravity] if isinstance(gravity, Stepwise) else []
+    out += [value for _, value in stepwise(conditions)]
     for one in conditions:
-        out += stepwise(one).values()
         if isinstance(one, Flux) and callable(one.flux) and not isinstance(one.flux, Stepwise):
             out += [one.at] if takes(one.flux) == ("t",) else []
     return out
@@ -105,6 +106,14 @@ def before_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], sta
         while end - start > 2 * near and (jump := _jump(function, start + near, end, near / 4)) is not None:
             end = jump
     return end
+
+
+def check_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], t: float, dt: float) -> None:
+    """Raise ValueError if a function jumps within the step from t (s), of length dt (s)."""
+    before = before_jumps(functions, t, t + dt) - t
+    if dt - before > ROUND_OFF * max(abs(t), abs(t + dt)):
+        what = f"step: dt = {dt!r} s from t = {t!r} s: a value jumps within the step"
+        raise ValueError(f"{what}, must be at most {before!r} s, so that the step ends at the jump")
 
 
 def _jump(of: Callable[[float], NDArray], low: float, high: float, near: float) -> float | None:

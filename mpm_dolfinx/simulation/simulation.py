@@ -142,8 +142,7 @@ class Simulation:
         )
         given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": bool(inertia)}
         self.state = first_state(self.scene, given, later)
-        if initial:
-            self.state = balanced(self.scene, self.state)
+        self.state = balanced(self.scene, self.state) if initial else self.state
         self.jit = time.perf_counter() - start
         """Wall time for compiling or loading the forms, in s."""
 
@@ -316,7 +315,7 @@ class Simulation:
             change: a present `Displacement` with the value d then moves its side by another d.
         fields
             New values of `points.data`, by name: arrays (n, ...) for the n points of this process, or one value for
-            all.  These are state variables of laws, material constants that vary with position, and data of the user.
+            all: state variables of laws, constants that vary with position (not those of wet pores), and user data.
 
         Raises
         ------
@@ -328,17 +327,18 @@ class Simulation:
         self.state = next_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
     def step(self, dt: float) -> Report:
-        """Advance by one step of length `dt`, in s, and return the report of the step.
+        """Advance by one step of length `dt`, in s, and return the report of the step.  `run` may divide steps.
 
         Raises
         ------
         NotConverged, LeftGrid
             The step fails, but a shorter step may succeed.
         ValueError
-            A function of time returns an invalid value.
+            A function of time returns an invalid value, or jumps within the step (see `Stepwise`).
         """
+        self._state.stage.check_jumps(self._state.t, dt)
         distribute(self)
-        self.state, report = self.advanced(dt)
+        self._state, report = self.advanced(dt)
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
