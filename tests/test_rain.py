@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Rain infiltrates until the surface ponds, then runs off; water evaporates until the surface is dry."""
 
+import warnings
 from functools import cache
 
 import numpy as np
@@ -37,6 +38,21 @@ def test_rain_beyond_what_soil_takes_ponds_and_runs_off(retention, depth, flows)
             assert -out[1] + runs == pytest.approx(3 * K, rel=1e-10)  # rain is what soaks in and what runs off
     assert [out[0], -out[1], runs] == pytest.approx([flows * K, flows * K, (3 - flows) * K], rel=1e-3)
     assert not retention or water(s) > start
+
+
+def test_a_stage_that_ends_a_pond_says_so():
+    """Earlier, the water of the pond vanished without a word."""
+    s = rained(9 * K, ponding=0.02 * WATER, retention=True)
+    s.run(1800, 300, progress=False)
+    pond = s.outcome("ponded")["rain"]
+    drain, rain = s.conditions
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", mpm.ResultWarning)
+        s.stage(conditions=[rain, drain, mpm.Traction("top", (0, -1.0))])
+    assert s.outcome("ponded")["rain"] == pond > 0
+    with pytest.warns(mpm.ConditionWarning, match=rf"stage: rain: its pond of {pond:.3g} m\^2 runs off"):
+        s.stage(conditions=[drain, mpm.Rain("top", 0.0, ponding=0.02 * WATER, name="rain")])
+    assert s.outcome("ponded")["rain"] == 0
 
 
 @pytest.mark.parametrize("retention", [True, False])

@@ -333,7 +333,7 @@ class Rain(Flux):
         evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
         Pressure of a full pond, in Pa, >= 0: its depth times the unit weight of water.  The pond has uniform depth over
-        the side.  Ponded water infiltrates or evaporates later.
+        the side.  Ponded water infiltrates or evaporates later.  If a stage ends the condition, the pond runs off.
     driest
         Lowest pressure at the side, in Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By
         Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.  If the units are not SI, give a value.

@@ -62,6 +62,9 @@ REMARKABLE = 0.05
 This value is also the largest allowed relative residual of the forces.
 """
 
+OF_CONTENT = ("porosity", "biot", "grain_bulk")
+"""Material constants that determine the fluid content at a given pressure and volume."""
+
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
     """Return the state of a scene in its first stage, before its initial stresses are balanced."""
@@ -177,6 +180,10 @@ def _stage_after(
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
         _warn_moved_on(scene, before, after)
+    for name, volume in state.outcome.get("ponded", {}).items():
+        if volume > 0 and after.given.get(name) is not before.given[name]:
+            what = "stage: %s: its pond of %.3g m^%d runs off, because this condition ends; to change the rain, "
+            warn(scene.grid.comm, ConditionWarning, f"{what}give it as a function of t", name, volume, scene.grid.dim)
     return after
 
 
@@ -423,7 +430,16 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
         if name not in data and (close := get_close_matches(name, data)):
             warn(comm, ConditionWarning, "%s: new data that no law reads; is %r meant?", what, close[0])
         data[name] = new.copy()
-    return together(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
+
+    def checked_fields() -> MaterialPoints:
+        new = scene.materials.changed("stage: fields", replace(points, data=data), fields)
+        for name in [name for name in OF_CONTENT if scene.fluid and name in fields and name in points.data]:
+            for k in np.flatnonzero(data[name] != points.data[name])[:1]:
+                what = f"stage: fields: {name!r} = {data[name][k]:g}: water would appear or vanish"
+                raise ValueError(f"{what}, must remain {points.data[name][k]:g} in a scene with fluid")
+        return new
+
+    return together(comm, checked_fields)
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
