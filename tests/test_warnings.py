@@ -55,6 +55,13 @@ def drained(pressure, side="right", gravity=(0, -9.81)):
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOFT], walls=WALLS, conditions=held, **water)
 
 
+def under_water_along_x(gravity):
+    """Return a box below a water level, with gravity that does not point down."""
+    grid, level = mpm.Grid([0, 0], [2.0, 1.0], [8, 4]), mpm.hydrostatic(1.5)
+    scene = {"conditions": mpm.water("right", 1.5), "fluid": mpm.Fluid(), "gravity": gravity, "pressure": level}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOFT], walls=WALLS, **scene)
+
+
 def in_mm_per_day(t, X):
     return np.where((X[:, 0] < 0.3) & (t > 15), 26.0, 0.0)
 
@@ -86,6 +93,16 @@ CASES = {
     "of an angle": (in_radians, mpm.ConditionWarning, r"friction = 0\.559 degrees, .* not in radians"),
     "of a seeded body": (thin, mpm.ResolutionWarning, "1 point over its thickness"),
     "of conditions": (sea_water, mpm.ConditionWarning, "unit_weight = 9810"),
+    "of a water level under gravity along x": (
+        lambda: under_water_along_x((-9.81, 0)),
+        mpm.ConditionWarning,
+        r"pressure: the level .* gravity is \[-9.81, 0.0\], so this water is not at rest",
+    ),
+    "of a water level under upward gravity": (
+        lambda: under_water_along_x((0, 9.81)),
+        mpm.ConditionWarning,
+        r"water at 'right': the level .* gravity is \[0.0, 9.81\], so this water is not at rest",
+    ),
     "of a step": (lambda: overlapping().step(1.0), mpm.ResolutionWarning, "filled to 200 %"),
 }
 
@@ -105,6 +122,18 @@ def test_a_storm_on_unsaturated_sand_gives_no_warning():
         warnings.simplefilter("error", mpm.ResultWarning)
         rained(3e-4, mpm.Gardner(1e3))
         rained(lambda t: 3e-4, mpm.Gardner(1e3)).run(1.0, 1.0, progress=False)
+
+
+def test_saturated_soil_below_unsaturated_soil_gives_no_warning_of_numpy():
+    """Earlier, a hyperbolic cosine overflowed at pressures above 710 Pa, in a value that was not used."""
+    grid = mpm.Grid([0, 0], [0.2, 1.4], [2, 14])
+    layers = [mpm.box(grid, [0, 0], [0.2, 0.53]), mpm.box(grid, [0, 0.53], [0.2, 1], material=1)]
+    soils = [replace(SOFT, conductivity=1e-5), replace(SOFT, conductivity=1e-6, retention=mpm.Gardner(5e3))]
+    scene = {"pressure": mpm.hydrostatic(0.6), "initial_stress": mpm.K0(0.5), "conditions": [mpm.Rain("top", 5e-7)]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        s = mpm.Simulation(grid, layers, soils, fluid=mpm.Fluid(), walls=WALLS, gravity=(0, -9.81), **scene)
+        s.run(2000.0, 2000.0, progress=False)
 
 
 @pytest.mark.parametrize(

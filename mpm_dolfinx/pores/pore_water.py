@@ -73,7 +73,7 @@ class PoreWater:
                 return p
             low, high = np.where(off < 0, y, low), np.where(off > 0, y, high)
             slopes = sum_by(self.slot, self.store * np.exp(at / self.bulk) + self.pores * slope, count)
-            slopes = slopes * np.where(y < 0, scale * np.cosh(y), scale)
+            slopes = slopes * scale * np.cosh(np.minimum(y, 0.0))
             with np.errstate(divide="ignore", invalid="ignore"):
                 new = y - np.clip(np.nan_to_num(off / slopes), -2, 2)
                 middle = (low + high) / 2

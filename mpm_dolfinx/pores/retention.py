@@ -444,7 +444,7 @@ def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.
 
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the pressures, in Pa, at which `logarithm` has the values y."""
-    return np.where(y < 0, scale * np.sinh(y), scale * y)
+    return scale * np.where(y < 0, np.sinh(np.minimum(y, 0.0)), y)
 
 
 FARTHEST = np.log(10)
