@@ -47,6 +47,11 @@ def test_a_block_that_falls_gains_what_its_weight_does():
     assert e["external"][-1] == pytest.approx(drop, rel=1e-9)
     assert e["kinetic"][-1] - e["kinetic"][0] == pytest.approx(drop, rel=1e-9)
     assert e["kinetic"][0] == pytest.approx(RHO * 0.4**2 * 0.1 / 2, rel=1e-9)
+    assert not e["renewal"].any(), "all energies of `Result.energies` exist, also without renewal"
+    with pytest.raises(KeyError, match="'friction_1': must be one of 'kinetic', 'elastic'"):
+        e["friction_1"]
+    with pytest.raises(KeyError, match="'kinetic': must be one of the names of results, but there are none"):
+        s.run(0.6, 0.05, progress=False).energies["kinetic"]
 
 
 def test_a_block_of_moist_soil_gains_what_its_own_weight_does():

@@ -21,4 +21,5 @@ class ByName(dict[str, T]):
 
     def __missing__(self, name: Any) -> T:
         """Raise KeyError for an unknown name."""
-        raise KeyError(f"{name!r}: must be one of {', '.join(map(repr, self)) or 'no names'}")
+        known = ", ".join(map(repr, self)) or "the names of results, but there are none"
+        raise KeyError(f"{name!r}: must be one of {known}")

@@ -46,14 +46,13 @@ def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bo
 
 
 def initial_energies(
-    materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
+    materials: SceneMaterials, points: MaterialPoints, kinetic: float
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies at the start of a run, in J, see `Result.energies`.
 
     `kinetic`: kinetic energy of free tools, in J.
-    `renews`: whether domains may be renewed.
     """
-    works = dict.fromkeys(("internal", "viscous", "friction", "external", *["renewal"] * renews), 0.0)
+    works = dict.fromkeys(("internal", "viscous", "friction", "external", "renewal"), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)
 
 
@@ -76,7 +75,7 @@ def after(
     works = {name: float(before[name]) + more for name, more in work}
     now = stored(materials, points)
     start = before["elastic"] + before["dissipated"] - before["internal"]
-    works |= {name: float(before[name]) for name in ("renewal",) if name in before}
+    works["renewal"] = float(before.get("renewal", 0.0))
     return _named(now, works, start + works["internal"] - now["elastic"], kinetic)
 
 

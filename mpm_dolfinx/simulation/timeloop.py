@@ -254,7 +254,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
         kinetic = state.stage.kinetic(outcome)
-        outcome["energy"] = initial_energies(scene.materials, state.points, kinetic, scene.numerics.renewal)
+        outcome["energy"] = initial_energies(scene.materials, state.points, kinetic)
     return replace(state, outcome=outcome)
 
 
