@@ -54,18 +54,23 @@ def test_no_cell_of_flowing_clay_holds_more_than_its_volume():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cells", "renewal", "most"), [(12, False, 1.002), (6, True, 1.015)])
-def test_clay_that_runs_out_by_two_widths_fills_no_cell_twice(cells, renewal, most):
+@pytest.mark.parametrize(
+    ("cells", "renewal", "most", "volumes"),
+    [(12, False, 1.002, 5e-4), (6, False, 1.12, 2e-3), (6, True, 1.015, 5e-4)],
+)
+def test_clay_that_runs_out_by_two_widths_fills_no_cell_twice(cells, renewal, most, volumes):
     """Without kept volumes, cells were filled to 110 and 104 %, and domains grew by 2.4 and 5.9 %.
 
     Without renewal, domains are inverted. If inverted parts counted as positive, the largest filling would be 100.03,
-    107 or 116 %, depending on the last digits of the corners.
+    107 or 116 %, depending on the last digits of the corners. When corners of inverted domains separated from the same
+    corners of other domains, the largest filling was 100.03 or 102.2 to 102.8 %, depending on these digits, and 128 %
+    with 6 cells.
     """
     fill, volume, reach = collapsed(cells, weak=400.0, steps=10, renewal=renewal)
     print(f"{cells} cells, renewal {renewal}: {100 * fill.max():.2f} %, volume {np.ptp(volume):.1e}")
     assert reach[-1] > 2.8
     assert fill.max() < most
-    assert volume == pytest.approx(1, abs=5e-4)
+    assert volume == pytest.approx(1, abs=volumes)
 
 
 def sheet(strengths, stage):
@@ -116,6 +121,24 @@ def test_folded_domains_fill_no_cell_twice(dim):
     middle = np.stack([np.bincount(pieces.cell, pieces.fraction * size[pieces.point] * x) for x in pieces.x.T], axis=1)
     index = np.stack(np.unravel_index(np.arange(grid.cells), grid.shape), axis=1)
     assert middle == pytest.approx(index + 0.5, abs=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_common_corner_of_a_folded_domain_stays_common(dim):
+    """A corner of yielded soil lies in a cell where a folded domain has no piece. Earlier, the corners separated."""
+    grid = mpm.Grid([0.0] * dim, [3.0] * dim, [3] * dim)
+    body = mpm.box(grid, [0.0] * dim, [3.0] * dim)
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1.0, shear=1.0)], walls={"bottom": "xyz"[:dim]})
+    corners = s.points.corners.copy()
+    common = np.abs(corners - 0.5).max(axis=2) < 1e-9
+    corners[common] = [1.1] + [0.6] * (dim - 1)
+    at, _ = common.nonzero()
+    cuts = CutDomains(grid, replace(s.points, corners=corners), True)
+    empty = ~np.isin(at, cuts.pieces.point[cuts.pieces.cell == cuts.grid.number(np.array([[1] + [0] * (dim - 1)]))])
+    assert empty.any() and not empty.all() and len(at) == 2**dim
+    u = np.random.default_rng(1).normal(size=(len(grid.node_x), dim))
+    for moved in cuts.followed(u, np.ones(grid.num_local, dtype=bool), yielded=np.ones(len(s.points), dtype=bool)):
+        assert np.ptp(moved[common], axis=0).max() < 1e-12 < np.abs(moved).max()
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -251,7 +251,7 @@ class CutDomains(Keyed):
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
         inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros(outward.shape), where=size > 0)
-        cell = self._filled_cell(at[face], middle + inward[face])
+        cell = self._filled_cell(at[face], self._cell(at[face], middle + inward[face]))
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.arange(len(several)).repeat(list(map(len, several)))[here][face]
         out = []
@@ -268,13 +268,22 @@ class CutDomains(Keyed):
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
     def followed(
-        self, u: NDArray[np.float64], filled: NDArray[np.bool_], one_sided: bool = True
+        self,
+        u: NDArray[np.float64],
+        filled: NDArray[np.bool_],
+        one_sided: bool = True,
+        yielded: NDArray[np.bool_] | None = None,
     ) -> Iterator[NDArray[np.float64]]:
         """Yield two arrays (n, 2^d, d), in m: the Q1 field u (nodes, d) at the corners, and its quadratic correction.
 
+        Inverted parts of domains have no pieces.  If a domain has no piece in the cell of its corner, this corner
+        follows the cell of the domain's largest piece, so that F is consistent.  In yielded soil, F does not depend on
+        corners.  The corner then follows its own cell, because other domains have the same corner.
+
         `filled`, `one_sided`: see `bending.followed`.
+        `yielded` (n,): whether the domain is of yielded soil, by default none.
         """
-        exchange, cells = self._followed
+        exchange, cells = self._followed if yielded is None else self._together(yielded)
         moved = followed(self.grid, cells, exchange.send(self._tracked), u, filled, one_sided)
         return (exchange.back(v).reshape(self.points.corners.shape) for v in moved)
 
@@ -284,12 +293,33 @@ class CutDomains(Keyed):
         return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
+    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Points of `_tracked` positions, the cells that contain these positions, and the cells that they follow."""
+        at = np.arange(len(self.points))
+        at = at.repeat(2**self.grid.dim) if self.domains else at
+        own = self._cell(at, self._inside(at, self._tracked))
+        return at, own, self._filled_cell(at, own)
+
+    @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
         """Exchange that sends `_tracked` positions to the owners of their cells, and the cells of these positions."""
-        grid, at = self.grid, np.arange(len(self.points))
-        cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
-        exchange = Exchange(grid.comm, grid.owner(cell))
-        return exchange, grid.locals[exchange.send(cell)]
+        return self._sent(self._places[2])
+
+    def _sent(self, cell: NDArray[np.int64]) -> tuple[Exchange, NDArray[np.int32]]:
+        exchange = Exchange(self.grid.comm, self.grid.owner(cell))
+        return exchange, self.grid.locals[exchange.send(cell)]
+
+    def _together(self, yielded: NDArray[np.bool_]) -> tuple[Exchange, NDArray[np.int32]]:
+        """Return `_followed`, but corners of yielded domains follow the filled cells that contain them."""
+        at, own, cell = self._places
+        other = (yielded[at] & (cell != own)).nonzero()[0]
+        if not over_all(self.grid.comm, len(other)):
+            return self._followed
+        exchange, cells = self._sent(own[other])
+        filled = exchange.back(np.isin(cells, self.cells))
+        cell = cell.copy()
+        cell[other[filled]] = own[other[filled]]
+        return self._sent(cell)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the total displacements (m, d), in m, of the pieces' centroids."""
@@ -302,20 +332,28 @@ class CutDomains(Keyed):
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return lexicographic indices (n,) of the cells of positions x (n, d), in m, in the domains of points `at`."""
-        # rounding must not assign a corner on a grid line to a cell outside the domain
-        return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
+        return self._filled_cell(at, self._cell(at, self._inside(at, x)))
 
-    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cell of each position x. Without a piece in it, return the cell of the domain's largest piece."""
+    def _inside(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return positions slightly nearer to the points `at`, so that corners on grid lines are in their domains."""
+        return x + NEAR * (self.points.x[at] - x)
+
+    def _cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the lexicographic index of the cell that contains each position x."""
+        return self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
+
+    def _filled_cell(self, at: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return cells: `own`, or the cell of the largest piece of the domain if it has no piece in the cell `own`."""
         pieces, cells = self.pieces, self.grid.all_cells
-        cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
-        key, keys = at * cells + cell, pieces.point * cells + pieces.cell
+        key, keys = at * cells + own, pieces.point * cells + pieces.cell
         if not len(key):
-            return cell
+            return own
         found = np.minimum(keys.searchsorted(key), len(keys) - 1)
         empty = keys[found] != key
-        if empty.any():
-            cell[empty] = pieces.cell[self._largest()[at[empty]]]
+        if not empty.any():
+            return own
+        cell = own.copy()
+        cell[empty] = pieces.cell[self._largest()[at[empty]]]
         return cell
 
     def _largest(self) -> NDArray[np.int64]:
