@@ -39,7 +39,7 @@ CRUMB = NEAR
 The remaining parts of the domain receive the mass and the seeded faces of a removed part.  Source: `NEAR`.
 """
 SMALL = (0.5 / EDGES) ** 2
-"""Cells in which a part of an old domain has less than this fraction of the cell area are renewed too.
+"""Cells of yielded soil in which a part of an old domain has less than this fraction of the cell area are renewed too.
 
 Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell).
 """
@@ -103,7 +103,8 @@ class RefilledCells:
     """The renewed cells at a reset of the grid, and their new domains.
 
     `body` (n,): index of the body of each point.
-    `flowed` (n,): whether the domains of points may be renewed.
+    `free` (n,): whether the domains of points may be replaced.
+    `flowed` (n,): whether points have yielded or have been renewed.
     `needs` (n,): whether the domains of points need renewal.
     `faces`: surface of the bodies.
     `signs`: keys of seeded faces, and the index of the set of conditions on each of these faces.
@@ -115,6 +116,7 @@ class RefilledCells:
         grid: Grid,
         points: MaterialPoints,
         body: NDArray[np.int64],
+        free: NDArray[np.bool_],
         flowed: NDArray[np.bool_],
         needs: NDArray[np.bool_],
         faces: OuterFaces,
@@ -129,12 +131,15 @@ class RefilledCells:
         self.cells = grid.cells
         self.faces = faces
         self.parts = self._parts()
-        excluded = self._excluded(flowed, signs)
+        excluded = self._excluded(free, signs)
         self.crossed, self.region = self._chains(excluded)
         size = self._areas / self._volume(self.cell)
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
-        self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
+        elastic = np.zeros(self.cells, dtype=bool)
+        elastic[self.cell[~flowed[self.pieces.point]]] = True
+        small = (size < SMALL) & ~elastic[self.cell]  # or renewal would spread through elastic soil
+        self.chosen = self._chosen(free & flowed & needs, excluded, small)
         """Whether each cell (cells,) is renewed."""
         self.affected = self._at(self.chosen)
         """Whether each point (n,) loses its domain or a part of it."""
@@ -159,15 +164,15 @@ class RefilledCells:
         out[self.pieces.point[cells[self.cell]]] = True
         return out
 
-    def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed, because of elastic soil, two bodies, or conditions on faces."""
+    def _excluded(self, free: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
+        """Return which cells cannot be renewed: domains must stay, or there are two bodies or conditions on faces."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
         np.minimum.at(low, cell, self.body[of])
         np.maximum.at(high, cell, self.body[of])
         excluded = low != high
-        excluded[cell[~flowed[of]]] = True
+        excluded[cell[~free[of]]] = True
         sign = signs[1][np.searchsorted(signs[0], self.faces.key[parts.row])]
         excluded[parts.cell[sign == NONE]] = True
         place = 5 * parts.cell + parts.side + 1  # inside the cell, or on one of its sides

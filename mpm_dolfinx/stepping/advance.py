@@ -342,7 +342,8 @@ class Motion:
             held |= one.near(state.points, points.corners)
         own = self._own(stage, points)
         free, body = own & ~held[:, :, None], self._body(points)
-        domains = Domains(points.id, points.corners, points.volume0 * points.J, yielded, free, body, number)
+        of, before = (points.id, points.corners, points.volume0 * points.J), state.points.corners
+        domains = Domains(*of, yielded, free, body, number, before)
         corners = with_volumes(grid, domains)
         corners[yielded] = stopped(grid, stage.conditions["walls"], corners[yielded], points.corners[yielded])
         for one in loads:

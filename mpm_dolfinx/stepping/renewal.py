@@ -2,7 +2,7 @@
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
 F of yielded soil is updated by increments, so the domains of this soil serve for integration only. A cell is filled
-anew if it contains a piece of a domain that is longer than `LONGEST`:
+anew if it contains a piece of a domain of yielded soil that is longer than `LONGEST`:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
@@ -11,7 +11,9 @@ in the cell becomes a polyline of `EDGES` edges. The filled area does not change
 The parts of old domains outside these cells become new domains. Each cell conserves mass, volume, mass of fluid, and
 mass-weighted sums of other point data. With inertia, each cell also conserves momentum and angular momentum. Point data
 of a new domain are means over the old domains in its area, corrected to first order for its centroid. Cells are not
-filled anew if they contain elastic soil, several bodies, several crossings of the surface, or a prescribed side.
+filled anew if they contain soil whose law cannot yield, several bodies, several crossings of the surface, or a
+prescribed side. Soil that has not yielded is renewed only in cells that it shares with distorted domains of yielded
+soil. Otherwise the parts of yielded domains that enter such a cell would accumulate there.
 """
 
 from __future__ import annotations
@@ -59,14 +61,19 @@ class Renewal:
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n,) of points that have yielded or have been renewed."""
+        renewed = (points.id >= self._starts[-1]) & ~is_part(points)
+        return self._may_yield(points) & (self._materials.evolved(points) | renewed)
+
+    def _may_yield(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return a mask (n,) of points whose laws have the state variable `plastic`."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
-        known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
-        return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]) & ~is_part(points))
+        return np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask of `flowed` points whose domains may be replaced."""
-        free = self.flowed(state.points) & ~self._faces.needed(state.stage.lasting, state.points)
+        """Return a mask (n,) of points whose domains may be replaced.  Parts of elastic domains are divided instead."""
+        free = self.flowed(state.points) | (self._may_yield(state.points) & ~is_part(state.points))
+        free &= ~self._faces.needed(state.stage.lasting, state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps
@@ -78,7 +85,7 @@ class Renewal:
         """
         comm = self._grid.comm
         needs = self.long(state.points)
-        if not over_all(comm, int(needs.any() and (needs & self._free(state)).any())):
+        if not over_all(comm, int(needs.any() and (needs & self.flowed(state.points) & self._free(state)).any())):
             return state, 0
         if comm.size > 1:
             state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
@@ -102,7 +109,8 @@ class Renewal:
         signs = self._signs((stage,), lambda: self._faces.signatures(stage.faces), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
-        work = RefilledCells(self._grid, points, body, self._free(state), needs, self._faces.of(points), signs, moves)
+        masks = self._free(state), self.flowed(points), needs
+        work = RefilledCells(self._grid, points, body, *masks, self._faces.of(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders[0]]
