@@ -291,7 +291,7 @@ class Mass:
 
         `rate`, in 1/s^2: see `Inertia`.
         """
-        cut, grid, places, (off, second) = self._cut, self._forms.grid, self._pieces.places, self._moments
+        cut, grid, places, (off, second, _) = self._cut, self._forms.grid, self._pieces.places, self._moments
         L = columns(velocity_gradients(points)).take(cut.pieces.point, axis=2)
         v = points.data[VELOCITY][cut.pieces.point].T + product(L, off[:, None])[:, 0]
         sent = (cut.pieces_to_cells(np.moveaxis(values, -1, 0)) for values in (v, product(L, second)))
@@ -324,27 +324,51 @@ class Mass:
         return max(size, NEAR * whole)
 
     def carried(
-        self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], rate: float, moved: NDArray | None
+        self,
+        points: MaterialPoints,
+        velocities: tuple[PETSc.Vec, PETSc.Vec],
+        rate: float,
+        moved: NDArray | None,
+        parts: tuple[NDArray[np.int64], int],
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data `VELOCITY` and `RATE` after a step.
 
         Let Q v be the projection of point velocities v to the nodes and back.  The part that relaxes is (1 - Q)^2 v, as
         in XPIC of order 2 (Hammerquist and Nairn 2017).  Modes that the nodes represent partly are thus damped less
-        than by (1 - Q) v.
+        than by (1 - Q) v.  This part has at most the kinetic energy that the variation of Q v within cells has.
+        Without this limit it would remain in a body that comes to rest.
 
         `points`: material points at the start of the step.
         `velocities`: velocities of the unknowns, in m/s, at the start and at the end of the step.
         `rate`, in 1/s^2: see `Inertia`.
         `moved` (n,): motion of the points in the step, in cell sizes.  None: all points keep their pieces.
+        `parts`: index (n,) of the connected part of each point, and the number of parts.
         """
         start, end = velocities
-        out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
+        seen, change = self._at_points(points, start), self._at_points(points, end - start)
+        out = {name: points.data[name] + change[name] for name in change}
         if moved is not None:
-            k = -np.expm1(-RELAXES * moved)
-            rest = replace(points, data=points.data | self._unseen(points, start))
-            for name, values in self._unseen(rest, self.velocity(rest, rate)).items():
+            rest = replace(points, data=points.data | {name: points.data[name] - seen[name] for name in seen})
+            projected = self._at_points(rest, self.velocity(rest, rate))
+            unseen = {name: rest.data[name] - projected[name] for name in projected}
+            after = replace(points, data=points.data | {name: seen[name] + change[name] for name in seen})
+            excess = self._excess(replace(points, data=points.data | unseen), after, *parts)
+            k = np.maximum(-np.expm1(-RELAXES * moved), excess)
+            for name, values in unseen.items():
                 out[name] -= k.reshape(-1, *[1] * (values.ndim - 1)) * values
         return out
+
+    def _excess(
+        self, unseen: MaterialPoints, seen: MaterialPoints, part: NDArray[np.int64], count: int
+    ) -> NDArray[np.float64]:
+        """Return the fraction (n,) of the `unseen` velocities beyond their largest energy, see `carried`."""
+        grid, volume = self._forms.grid, unseen.volume0 * unseen.J
+        L, rate = (columns(velocity_gradients(of)) for of in (unseen, seen))
+        own = (unseen.data[VELOCITY] ** 2).sum(axis=1) + (product(L, self._moments[2]) * L).sum(axis=(0, 1))
+        within = ((rate**2).sum(axis=0).T * grid.sizes_at(unseen.x) ** 2).sum(axis=1) / 12
+        energies = np.array([np.bincount(part, volume * of, count) for of in (own, within)])
+        own, within = grid.comm.allreduce(energies)
+        return 1 - np.sqrt(np.divide(within, own, out=np.ones(count), where=own > within))[part]
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
         """Return a vector of the unknowns as a local array with zeros at fixed displacements."""
@@ -354,19 +378,19 @@ class Mass:
         return work.x.array.copy()
 
     @cached_property
-    def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Vectors (d, m), in m, from centroids of domains to centroids of pieces, and second moments (d, d, m), in m^2.
+    def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Vectors (d, m), in m, from centroids of domains to centroids of pieces, and second moments, in m^2.
 
-        Second moments of the m pieces are about their centroids.
+        The moments of the pieces (d, d, m) and of the domains (d, d, n) are about their centroids.
         """
         pieces = self._cut.pieces
-        return columns(pieces.x - self._cut.mean(pieces.x)[pieces.point]), columns(pieces.second)
+        off, second = columns(pieces.x - self._cut.mean(pieces.x)[pieces.point]), columns(pieces.second)
+        return off, second, self._mean(off[:, None] * off + second)
 
     @cached_property
     def _focus(self) -> NDArray[np.float64]:
-        """Inverses (d, d, n), in 1/m^2, of the second moments of the domains about their centroids."""
-        off, second = self._moments
-        return inverses(self._mean(off[:, None] * off + second))
+        """Inverses (d, d, n), in 1/m^2, of the second moments of the domains."""
+        return inverses(self._moments[2])
 
     @cached_property
     def _least_rate(self) -> float:
@@ -379,17 +403,13 @@ class Mass:
         pieces = self._cut.pieces
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
-    def _unseen(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return the point data `VELOCITY` and `RATE` minus those of the field of the nodal velocities v."""
-        return {name: points.data[name] - values for name, values in self._at_points(points, v).items()}
-
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
         """Return affine velocity fields: in each domain, the field nearest to the field of the nodal velocities v."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
         at, slope = (columns(cut.to_pieces(values)) for values in (at, slope.reshape(-1, d, d)))
-        mean, (off, second) = self._mean(at), self._moments
+        mean, (off, second, _) = self._mean(at), self._moments
         moment = (at - mean.take(cut.pieces.point, axis=1))[:, None] * off + product(slope, second)
         rate = product(product(self._mean(moment), self._focus), columns(points.F[:, :d, :d]))
         return {VELOCITY: mean.T, RATE: rate.transpose(2, 0, 1)}

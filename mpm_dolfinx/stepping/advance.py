@@ -89,7 +89,7 @@ class Motion:
         loads: Sequence[Loads],
         net_inflow: NDArray[np.float64] | None = None,
         report: Report | None = None,
-        carried: Callable[[NDArray | None], dict[str, NDArray]] | None = None,
+        carried: Callable[[NDArray | None, tuple[NDArray[np.int64], int]], dict[str, NDArray]] | None = None,
         stays: bool = True,
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and the number of inverted domains.
@@ -131,7 +131,7 @@ class Motion:
                 goes, (part, count) = ~(keeps & stays), on_grid.parts
                 some = over_all(grid.comm, int(goes.any()))
                 moved = goes * cut.moved(cut.crossed(points), part, count)[part] if some else None
-                points = replace(points, data=points.data | carried(moved))
+                points = replace(points, data=points.data | carried(moved, (part, count)))
             points = self._dried(points, on_grid, data)
             if (data_now := self._materials.updated_state(points, state.points, t - state.t)) is not points.data:
                 points = replace(points, data=data_now)
