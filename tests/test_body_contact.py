@@ -56,12 +56,12 @@ def pressed_by(depth, height):
     return E * np.log(1 - depth / height) / (1 - depth / height)
 
 
-@pytest.mark.parametrize(("cells", "apart"), [(1.9, False), (2.1, True)])
-def test_groups_within_reach_of_a_step_are_paired_again(cells, apart):
+@pytest.mark.parametrize(("cells", "distant"), [(1.9, False), (2.1, True)])
+def test_groups_within_reach_of_a_step_are_paired_again(cells, distant):
     """A step moves groups by at most two cells towards each other."""
     s = two_blocks(gap=cells / 8)
     (contacts,) = (one for one in s.state.stage.acting if isinstance(one, Contacts))
-    assert contacts._apart(s.points) is apart
+    assert contacts._distant(s.points) is distant
 
 
 @pytest.mark.parametrize(("dim", "offset", "order"), [(2, 0.0, 1), (2, 0.37, -1), (2, 0.98, 1), (3, 0.37, 1)])

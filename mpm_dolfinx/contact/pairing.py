@@ -92,7 +92,7 @@ class Contacts(Touching):
         """Return the contact loads between groups in a substep."""
         cut, points = place.cut, place.points
         of = cut.points
-        found, apart = self._found(cut.key, lambda: (self._opposite_all(cut, of), self._apart(of)), self.grid.comm)
+        found, distant = self._found(cut.key, lambda: (self._opposite_all(cut, of), self._distant(of)), self.grid.comm)
         cell_pairs = partial(self._cell_pairs, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
 
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
@@ -101,9 +101,9 @@ class Contacts(Touching):
             return self._law(place, self._opposite_all(cut, present), present, present, cell_pairs)
 
         first_law = self._law(place, found, of, points, cell_pairs)
-        return ContactLoads(self, cut, *first_law, None if apart else again, cell_pairs)
+        return ContactLoads(self, cut, *first_law, None if distant else again, cell_pairs)
 
-    def _apart(self, points: MaterialPoints) -> bool:
+    def _distant(self, points: MaterialPoints) -> bool:
         """Return whether all groups are so far apart that none can touch in a step, see `check_end`."""
         comm, copy = self.grid.comm, self.grid.copy(points.id)
         groups = [points.corners[copy == k * self.grid.cells] for k in range(self.grid.copies)]

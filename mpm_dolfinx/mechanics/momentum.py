@@ -174,8 +174,9 @@ class MomentumForms:
         share = 1 / ufl.det(points.F)  # a common factor: a division would be compiled for each component
         P, A = share * P, share * A
         stress = P * points.F.T
-        turned = stress if points.chord is None else points.chord(points.gradient(self.u))[1] * stress
-        residual = ElementForces(turned, points)
+        if points.chord is not None:
+            stress = points.chord(points.gradient(self.u))[1] * stress
+        residual = ElementForces(stress, points)
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
