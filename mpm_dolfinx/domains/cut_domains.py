@@ -251,7 +251,7 @@ class CutDomains(Keyed):
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
         inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros(outward.shape), where=size > 0)
-        cell = self._filled_cell(at[face], self._cell(at[face], middle + inward[face]))
+        cell, _ = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.arange(len(several)).repeat(list(map(len, several)))[here][face]
         out = []
@@ -264,7 +264,7 @@ class CutDomains(Keyed):
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the values (n, d) of a Q1 field u (nodes, d) at the points.  Only for a cut without `domains`."""
-        exchange, cells = self._followed
+        exchange, cells = self._followed[:2]
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
     def followed(
@@ -283,7 +283,7 @@ class CutDomains(Keyed):
         `filled`, `one_sided`: see `bending.followed`.
         `yielded` (n,): whether the domain is of yielded soil, by default none.
         """
-        exchange, cells = self._followed if yielded is None else self._together(yielded)
+        exchange, cells = self._followed[:2] if yielded is None else self._together(yielded)
         moved = followed(self.grid, cells, exchange.send(self._tracked), u, filled, one_sided)
         return (exchange.back(v).reshape(self.points.corners.shape) for v in moved)
 
@@ -293,17 +293,16 @@ class CutDomains(Keyed):
         return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
-    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Points of `_tracked` positions, the cells that contain these positions, and the cells that they follow."""
+    def _followed(self) -> tuple[Exchange, NDArray[np.int32], tuple[NDArray[np.int64], ...]]:
+        """Exchange that sends `_tracked` positions to the owners of the cells that they follow, and these cells.
+
+        Then follow arrays with a row for each position: its point, the cell that contains it, and the cell it follows.
+        """
         at = np.arange(len(self.points))
         at = at.repeat(2**self.grid.dim) if self.domains else at
-        own = self._cell(at, self._inside(at, self._tracked))
-        return at, own, self._filled_cell(at, own)
-
-    @cached_property
-    def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
-        """Exchange that sends `_tracked` positions to the owners of their cells, and the cells of these positions."""
-        return self._sent(self._places[2])
+        x = self._tracked
+        cell, own = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
+        return *self._sent(cell), (at, own, cell)
 
     def _sent(self, cell: NDArray[np.int64]) -> tuple[Exchange, NDArray[np.int32]]:
         exchange = Exchange(self.grid.comm, self.grid.owner(cell))
@@ -311,10 +310,10 @@ class CutDomains(Keyed):
 
     def _together(self, yielded: NDArray[np.bool_]) -> tuple[Exchange, NDArray[np.int32]]:
         """Return `_followed`, but corners of yielded domains follow the filled cells that contain them."""
-        at, own, cell = self._places
+        exchange, cells, (at, own, cell) = self._followed
         other = (yielded[at] & (cell != own)).nonzero()[0]
         if not over_all(self.grid.comm, len(other)):
-            return self._followed
+            return exchange, cells
         exchange, cells = self._sent(own[other])
         filled = exchange.back(np.isin(cells, self.cells))
         cell = cell.copy()
@@ -332,29 +331,29 @@ class CutDomains(Keyed):
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return lexicographic indices (n,) of the cells of positions x (n, d), in m, in the domains of points `at`."""
-        return self._filled_cell(at, self._cell(at, self._inside(at, x)))
+        # rounding must not assign a corner on a grid line to a cell outside the domain
+        return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))[0]
 
-    def _inside(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions slightly nearer to the points `at`, so that corners on grid lines are in their domains."""
-        return x + NEAR * (self.points.x[at] - x)
+    def _filled_cell(
+        self, at: NDArray[np.int64], x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return two cells for each position x (n, d), in m, in the domains of points `at`.
 
-    def _cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic index of the cell that contains each position x."""
-        return self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
-
-    def _filled_cell(self, at: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return cells: `own`, or the cell of the largest piece of the domain if it has no piece in the cell `own`."""
+        The second contains the position.  The first is the same cell, or the cell of the largest piece of the domain if
+        the domain has no piece in the second.
+        """
         pieces, cells = self.pieces, self.grid.all_cells
+        own = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + own, pieces.point * cells + pieces.cell
         if not len(key):
-            return own
+            return own, own
         found = np.minimum(keys.searchsorted(key), len(keys) - 1)
         empty = keys[found] != key
         if not empty.any():
-            return own
+            return own, own
         cell = own.copy()
         cell[empty] = pieces.cell[self._largest()[at[empty]]]
-        return cell
+        return cell, own
 
     def _largest(self) -> NDArray[np.int64]:
         """Return the index of the largest piece of each point."""

@@ -118,7 +118,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                yielded = self._materials.evolved(state.points)
+                yielded = None if self._momentum.elastic else self._materials.evolved(state.points)
                 followed = cut.followed(nodal, on_grid.active.contains, not state.stage.inertia, yielded)
                 points, keeps, inverted = self._shaped(state, loads, on_grid, followed, deformed)
             else:
