@@ -167,7 +167,7 @@ def _hanging(grid: Grid, domains: Domains, number: NDArray[np.int64], moves: NDA
     normal = (b - a)[:, ::-1] * [1, -1]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY) * 2
     gap = ((1 - t) * a + t * b - node) * normal
-    return _Hanging(rows, normal[:, None] * np.stack([t / t, t - 1, -t], axis=1), gap.sum(axis=1))
+    return _Hanging(rows, normal[:, None] * np.stack([np.ones_like(t), t - 1, -t], axis=1), gap.sum(axis=1))
 
 
 def _sparse(values: NDArray[np.float64], columns: NDArray[np.int64], count: int) -> csr_matrix:
