@@ -88,15 +88,16 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
         full[invalid] = np.eye(3)
         x, axes = np.linalg.eigh(full)
         return np.where(invalid[:, None], np.nan, x), axes
-    mean, half = (b[:, 0] + b[:, 1]) / 2, (b[:, 0] - b[:, 1]) / 2
-    radius, angle = np.hypot(half, b[:, 3]), np.arctan2(b[:, 3], half) / 2
+    xx, yy, zz, xy = b.T.copy()  # of a strided column, rounding in arctan2 would depend on memory addresses
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
+    radius, angle = np.hypot(half, xy), np.arctan2(xy, half) / 2
     axes, (c, s) = np.zeros((n, 3, 3)), (np.cos(angle), np.sin(angle))
     axes[:, 0, 0] = c
     axes[:, 1, 0] = s
     axes[:, 0, 1] = -s
     axes[:, 1, 1] = c
     axes[:, 2, 2] = 1.0
-    return np.stack([mean + radius, mean - radius, b[:, 2]], axis=1), axes
+    return np.stack([mean + radius, mean - radius, zz], axis=1), axes
 
 
 class Coaxial:
