@@ -84,8 +84,9 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
     if g and np.linalg.norm(np.add(gravity, g * np.eye(len(gravity))[-1])) > WEIGHS * g:
         for name in sorted({name for name, value in levels if isinstance(value, OfWater)}):
-            what = "%s: the level is a height along the last axis, but gravity is %s, so this water is not at rest; "
-            warn(comm, ConditionWarning, f"{what}give the pressure as a function of x", name, line(list(gravity)))
+            along = line(np.asarray(gravity).tolist())
+            what = f"the level is a height along the last axis, but gravity is {along}, so this water is not at rest"
+            warn(comm, ConditionWarning, "%s: %s; give the pressure as a function of x", name, what)
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but density times gravity of %s is %.6g, so at equal "
