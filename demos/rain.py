@@ -21,7 +21,7 @@ With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degr
 stabilise the bank. The cohesion decreases with slip to a tenth of its initial value. The suction decreases until
 equilibrium is impossible. Then the bank slides with inertia, runs out over the rock and comes to rest. With 6 cells
 over its height, the bank fails after 1.7 h and runs out by 3.2 m. With 10 cells the bank fails after 1.5 h and runs out
-by 2.7 m. The demo checks the balances of energy and water. The demo runs on one process.
+by 2.6 m. The demo checks the balances of energy and water. The demo runs on one process.
 """
 
 from __future__ import annotations
