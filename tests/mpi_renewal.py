@@ -2,6 +2,7 @@
 """Push a disc through clay with renewal of domains, on any number of processes, and write its state."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ from mpm_dolfinx.stepping import renewal as domains
 CLAY = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3, conductivity=1e-6)
 
 
-def pushed(cells=8, renewal=True, wet=False, rings=False, **more):
+def pushed(cells=8, renewal=True, wet=False, rings=False, suction=False, **more):
     """Return a simulation of a disc, or with `rings` a ball, that is pushed into a block next to a pressure.
 
     cells: number of cells over the width of the block.
+    suction: the soil is unsaturated, above a water table.
     """
     grid = mpm.Grid([0, 0], [1.0, 1.2], [cells, 5 * cells // 4], axisymmetric=rings)
     block = mpm.box(grid, [0, 0], [1.0, 0.83])
@@ -25,14 +27,18 @@ def pushed(cells=8, renewal=True, wet=False, rings=False, **more):
     numerics = mpm.Numerics(renewal=renewal)
     conditions, fluid = ([disc, load, mpm.Drained("top")], mpm.Fluid()) if wet else ([disc, load], None)
     options = {"walls": walls, "conditions": conditions, "numerics": numerics, "fluid": fluid, **more}
-    return mpm.Simulation(grid, [block], [CLAY], **options)
+    soil = CLAY
+    if suction:
+        soil = replace(CLAY, retention=mpm.VanGenuchten(2e3, n=2.5))
+        options |= {"conditions": [disc, load], "gravity": (0, -9.81), "pressure": lambda x: -9810 * (x[:, 1] - 0.2)}
+    return mpm.Simulation(grid, [block], [soil], **options)
 
 
 def main(file, *words):
     """Write the state of a run of some kind, in two parts, or with "restart" from a checkpoint."""
     domains.LONGEST = 0.6  # cells: soon
     file = Path(file)
-    kind = {"wet": "wet" in words, **{name: True for name in ("inertia", "rings") if name in words}}
+    kind = {"wet": "wet" in words, **{name: True for name in ("inertia", "rings", "suction") if name in words}}
     simulation = pushed(**kind)
     if "restart" in words:
         half = mpm.Checkpoint(file.with_suffix(".checkpoint"))

@@ -10,6 +10,7 @@ import pytest
 import ufl
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.solve.newton import Newton
 
 WATER = 9810.0  # N/m^3
@@ -537,3 +538,19 @@ def test_a_curve_that_is_infinitely_steep_is_named_when_a_step_fails(air_entry):
     said = [str(w.message) for w in caught if "without air_entry" in str(w.message)]
     assert len(said) == (result.cuts > 0) == (not air_entry)
     assert not said or ("VanGenuchten(" in said[0] and "\n" not in said[0])
+
+
+@pytest.mark.parametrize("p", [-1e7, -1e3, 1e3, 1e7, 1e9])
+@pytest.mark.parametrize("entry", [np.inf, 1e4])
+def test_the_pressure_of_a_water_content_is_found_however_large_it_is(p, entry):
+    """Two pieces of a cell, of saturated (entry = inf) or unsaturated soil."""
+
+    def full(at):
+        S = np.exp(np.minimum(at, 0.0) / entry)
+        return S, np.where(at < 0, S / entry, 0.0)
+
+    scale, offset = 1.0 if entry == np.inf else entry, np.array([1.4e4, -1.3e5])
+    water = PoreWater(full, np.zeros(2, dtype=int), np.full(2, 1e-10), np.array([0.13, 0.27]), 2.2e9, np.array([scale]))
+    found = water.level(water.of_cells(p + offset), np.zeros(1), offset)
+    assert found == pytest.approx(p, rel=1e-3)
+    assert water.of_cells(found + offset) == pytest.approx(water.of_cells(p + offset), rel=1e-12)

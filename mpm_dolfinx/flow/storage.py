@@ -411,6 +411,8 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         forms.fluxes.slope.x.array[:] = 0.0
+        if inertial is not None:
+            inertial.move()
         outflow = flow(before is None)
         least, static = dt * outflow.mobility.min(axis=1), 1.0
         if inertial is not None:

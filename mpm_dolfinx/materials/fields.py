@@ -31,6 +31,7 @@ from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, DRIED, Fluid, Skeleton, constants_of
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 from mpm_dolfinx.pores.retention import sampled as drained
 
@@ -295,6 +296,25 @@ class SceneMaterials:
         """Return the characteristic suction of each point's retention curve, in Pa; infinite without a curve."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
+
+    def pore_water(
+        self,
+        points: MaterialPoints,
+        of: NDArray[np.int64],
+        volume: NDArray[np.float64] | float,
+        slot: NDArray[np.int64],
+    ) -> PoreWater:
+        """Return the pore water of k pieces, in groups.
+
+        `of` (k,): point of each piece.
+        `volume` (k,), m^d: volume of each piece.
+        `slot` (k,): index of the group of each piece.
+        """
+        scale = np.full(slot.max(initial=-1) + 1, np.inf)
+        np.minimum.at(scale, slot, self.retention_scale(points)[of])
+        full = partial(self.saturations, self.retention_rows(points)[of])
+        store, pores = (volume * values(points)[of] for values in (self.storage, self.porosity))
+        return PoreWater(full, slot, store, pores, self.fluid.bulk, np.minimum(scale, 1 / TINY))
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return alpha chi p at the points, in Pa, with the coefficients alpha of Biot and chi of Bishop."""

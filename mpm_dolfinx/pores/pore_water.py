@@ -75,7 +75,8 @@ class PoreWater:
             slopes = sum_by(self.slot, self.store * np.exp(at / self.bulk) + self.pores * slope, count)
             slopes = slopes * scale * np.cosh(np.minimum(y, 0.0))
             with np.errstate(divide="ignore", invalid="ignore"):
-                new = y - np.clip(np.nan_to_num(off / slopes), -2, 2)
+                most = 2 + np.maximum(y, 0.0)
+                new = y - np.clip(np.nan_to_num(off / slopes), -most, most)
                 middle = (low + high) / 2
             inside = (new > low) & (new < high)
             new = np.where(inside | ~np.isfinite(middle), new, middle)
@@ -84,6 +85,15 @@ class PoreWater:
                 return p
             y = np.where(bad, new, y)
         raise NotConverged("pore water: no pressure is found for the water content")
+
+
+def changes(old: PoreWater, before: NDArray[np.float64], new: PoreWater, p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the changes (n,), in Pa, after which the pieces `new` contain as much fluid in each slot as before.
+
+    `old`, `before`: earlier pieces and their pressures, in Pa.
+    `new`, `p`: present pieces and their pressures, in Pa, without the changes.
+    """
+    return new.level(old.of_cells(before), np.zeros(len(new.scale)), p)
 
 
 def emptied(

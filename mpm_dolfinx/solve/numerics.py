@@ -32,7 +32,7 @@ class Numerics:
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`.
-        Renewal requires quadrature "domain", and yielding dry or saturated soil in 2D, without a `Contact`.
+        Renewal requires quadrature "domain", and yielding soil in 2D, without a `Contact` and without `specific_yield`.
         Axisymmetric scenes with inertia have no renewal.  On a grid with `follow`, elastic domains are also divided and
         merged (`stepping/division.py`).  Division requires dry or saturated soil, without `Contact` and inertia.
     keep_volumes

@@ -36,7 +36,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import joined_parts
-from mpm_dolfinx.pores.pore_water import PoreWater
+from mpm_dolfinx.pores.pore_water import PoreWater, changes
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
 from mpm_dolfinx.stepping.stage import Stage
@@ -199,20 +199,12 @@ class OnGrid(Keyed):
         materials = self._materials
         points = self.cut.points
         bulk = self._storage.bulk
-        old = state.pieces
-        count, pieces = len(points), self.cut.pieces
-        pores, store = materials.porosity(points), materials.storage(points)
-        rows, scale = materials.retention_rows(points), materials.retention_scale(points)
-        scale = np.where(np.isinf(scale), 1.0, scale)
-
-        def of_points(at: NDArray[np.int64], share: NDArray[np.float64]) -> PoreWater:
-            full = partial(materials.saturations, rows[at])
-            return PoreWater(full, at, share * store[at], share * pores[at], bulk, scale)
-
+        old, pieces = state.pieces, self.cut.pieces
         owner = points.id.searchsorted(old.id)
         there = pressure_of(pi, bulk)
-        held = of_points(owner, old.fraction).of_cells(old.pressure)
-        more = of_points(pieces.point, pieces.fraction).level(held, np.zeros(count), there)
+        then = materials.pore_water(points, owner, old.fraction, owner)
+        now = materials.pore_water(points, pieces.point, pieces.fraction, pieces.point)
+        more = changes(then, old.pressure, now, there)
         if state.stay:
             more = np.where(state.stay.keeps, 0.0, more)
         return self.cut.pieces_to_cells(there + more[pieces.point])
@@ -424,13 +416,13 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain, or 1 as a placeholder.  None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain, at most 1 / `TINY`.  None in saturated scenes."""
         if self._materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
         of_points = self._materials.retention_scale(self.cut.points)
         np.minimum.at(scale, self.contents.slot(self.cut.cells), self.cut.to_cells(of_points))
-        return np.where(np.isinf(scale), 1.0, scale)
+        return np.minimum(scale, 1 / TINY)
 
     def resting_mobility(self) -> Mobility:
         """Return the conductivities (m/s) of filled owned cells in the reference configuration, as a `Mobility`."""

@@ -38,6 +38,7 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
+from mpm_dolfinx.pores.pore_water import changes
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
@@ -138,24 +139,46 @@ class Renewal:
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
-        """Return the pressures of the new domains: means of the old pressures, weighted by storage or volume."""
+        """Return the pressures of the new domains: means of the old pressures, weighted by storage or volume.
+
+        In unsaturated scenes, pressures are hydrostatic in each cell, and conserve the pore water of the cell.
+        """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
-        potential = transport(old.potentials(bulk), points, pieces)
+        rest = None if materials.retentions is None else materials.retentions.weight.value
         piece, groups, share = work.into
         of, count = pieces.point[piece], int(group.max()) + 1
         others = pieces.fraction.copy()
         others[piece] = 0.0  # very thin pieces are added to the other pieces of their domain
-        whole, held = (sum_by(pieces.point, others * values, len(points)) for values in (1.0, potential))
-        mean = np.divide(held, whole, out=np.zeros(len(points)), where=whole > 0)[of]
-        brings = pieces.fraction[piece] * potential[piece] + (share - pieces.fraction[piece]) * mean
+        whole = sum_by(pieces.point, others, len(points))
+        volume, new_volume = (of_points.volume0 * of_points.J for of_points in (points, made))
+
+        def brought(values: NDArray) -> NDArray:
+            """Return the parts of `values` of the pieces that enter the new domains."""
+            held = sum_by(pieces.point, others * values, len(points))
+            mean = np.divide(held, whole, out=np.zeros(len(points)), where=whole > 0)[of]
+            return pieces.fraction[piece] * values[piece] + (share - pieces.fraction[piece]) * mean
 
         def over(values: NDArray, weight: NDArray) -> NDArray:
             return sum_by(groups, values * weight[of], count)
 
-        volume, store = (of * points.volume0 * points.J for of in (1.0, materials.storage(points)))
+        given = old.potentials(bulk)
+        potential = transport(given if rest is None else given.less(rest), points, pieces)
+        brings = brought(potential)
         even = over(brings, volume) / over(share, volume)
-        stored = sum_by(group, materials.storage(made) * made.volume0 * made.J, count)
+        if rest is not None:  # heads are not linear in the content, which is conserved
+            there, owner = pressure_of(potential + pieces.x @ rest, bulk), points.id.searchsorted(old.id)
+            then = materials.pore_water(points, owner, old.fraction, owner)
+            now = materials.pore_water(points, pieces.point, pieces.fraction, pieces.point)
+            there += changes(then, old.pressure, now, there)[pieces.point]
+            held = materials.pore_water(points, pieces.point, 1.0, np.arange(len(there))).of_cells(there)
+            held = over(brought(held), volume)
+            middle = means_of_rows(group, new_volume, made.x, count)
+            water = materials.pore_water(made, np.arange(len(made)), new_volume, group)
+            head = (made.x - middle[group]) @ rest
+            return water.level(held, even + middle @ rest, head)[group] + head
+        store = materials.storage(points) * volume
+        stored = sum_by(group, materials.storage(made) * new_volume, count)
         return pressure_of(np.divide(over(brings, store), stored, out=even, where=stored > 0), bulk)[group]
 
     def _filled(

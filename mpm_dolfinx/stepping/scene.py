@@ -287,7 +287,7 @@ class Scene:
             return ()
         has = {
             "has groups in contact": grid.copies > 1,
-            "has pores that drain": self.materials.drains or self.materials.retentions is not None,
+            "has `specific_yield`": self.materials.drains,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
         }
         moves = self.momentum.inertia is not None
@@ -296,10 +296,15 @@ class Scene:
             "has inertia in axisymmetry": grid.axisymmetric and moves,
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }
-        of_lines = has | {"has inertia": moves, "has grid lines that stay": grid.follow is None}
+        unsaturated = self.materials.retentions is not None
+        of_lines = has | {
+            "has unsaturated soil": unsaturated,
+            "has inertia": moves,
+            "has grid lines that stay": grid.follow is None,
+        }
         found = [[what for what, so in of.items() if so] for of in (of_yield, of_lines)]
         if all(found):
-            allowed = "of soil that yields, dry or saturated, in 2D"
+            allowed = "of soil that yields, in 2D"
             if grid.follow is not None:
                 found, allowed = found[1:], "dry or saturated, without inertia, on a grid whose lines move"
             raise ValueError(f"Numerics(renewal=True): the scene {' and '.join(found[0])}, must be {allowed}")
