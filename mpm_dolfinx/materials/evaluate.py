@@ -9,6 +9,8 @@ from functools import cached_property
 from inspect import signature
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -34,7 +36,7 @@ class LawAtPoints:
     Parameters
     ----------
     grid
-        Background grid.
+        Background grid, or None outside a scene.
     law
         Class of the law.
     shapes
@@ -47,13 +49,13 @@ class LawAtPoints:
 
     def __init__(
         self,
-        grid: Grid,
+        grid: Grid | None,
         law: type[Skeleton],
         shapes: dict[str, tuple[int, ...]],
         stretches: int | None = None,
         cell_size: float | None = None,
     ):
-        self.grid = grid
+        self.grid = grid = grid or Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
         self.law = law
         self._shapes = shapes
         self._stretches = grid.stretches if stretches is None else stretches

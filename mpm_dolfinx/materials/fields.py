@@ -300,21 +300,30 @@ class SceneMaterials:
     def pore_water(
         self,
         points: MaterialPoints,
-        of: NDArray[np.int64],
+        at_pieces: Callable[[NDArray], NDArray],
         volume: NDArray[np.float64] | float,
         slot: NDArray[np.int64],
+        scale: NDArray[np.float64] | None = None,
     ) -> PoreWater:
-        """Return the pore water of k pieces, in groups.
+        """Return the pore water of k pieces in n groups, such as cells.
 
-        `of` (k,): point of each piece.
+        `at_pieces`: function that returns the values (k, ...) of the pieces from the values of the points.
         `volume` (k,), m^d: volume of each piece.
         `slot` (k,): index of the group of each piece.
+        `scale`: see `scales`, which is the default.
         """
-        scale = np.full(slot.max(initial=-1) + 1, np.inf)
-        np.minimum.at(scale, slot, self.retention_scale(points)[of])
-        full = partial(self.saturations, self.retention_rows(points)[of])
-        store, pores = (volume * values(points)[of] for values in (self.storage, self.porosity))
-        return PoreWater(full, slot, store, pores, self.fluid.bulk, np.minimum(scale, 1 / TINY))
+        full = partial(self.saturations, at_pieces(self.retention_rows(points)))
+        store, pores = (volume * at_pieces(values(points)) for values in (self.storage, self.porosity))
+        scale = self.scales(points, at_pieces, slot, slot.max(initial=-1) + 1) if scale is None else scale
+        return PoreWater(full, slot, store, pores, self.fluid.bulk, scale)
+
+    def scales(
+        self, points: MaterialPoints, at_pieces: Callable[[NDArray], NDArray], slot: NDArray[np.int64], count: int
+    ) -> NDArray[np.float64]:
+        """Return the suctions (count,), at most 1 / `TINY` Pa, at which groups of pieces drain, see `pore_water`."""
+        scale = np.full(count, 1 / TINY)
+        np.minimum.at(scale, slot, at_pieces(self.retention_scale(points)))
+        return scale
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return alpha chi p at the points, in Pa, with the coefficients alpha of Biot and chi of Bishop."""

@@ -48,6 +48,13 @@ class PoreWater:
         """Return the fluid contents of the cells, in m^d, from pi and `(S - 1) rho` of their pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
+    def changes(self, p: NDArray[np.float64], old: PoreWater, old_pressure: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the changes (n,) of the pressures p, in Pa, after which the cells have their earlier fluid contents.
+
+        `old`, `old_pressure`: earlier pieces of the cells, and their pressures, in Pa.
+        """
+        return self.level(old.of_cells(old_pressure), np.zeros(len(self.scale)), p)
+
     def level(
         self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
@@ -85,15 +92,6 @@ class PoreWater:
                 return p
             y = np.where(bad, new, y)
         raise NotConverged("pore water: no pressure is found for the water content")
-
-
-def changes(old: PoreWater, before: NDArray[np.float64], new: PoreWater, p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the changes (n,), in Pa, after which the pieces `new` contain as much fluid in each slot as before.
-
-    `old`, `before`: earlier pieces and their pressures, in Pa.
-    `new`, `p`: present pieces and their pressures, in Pa, without the changes.
-    """
-    return new.level(old.of_cells(before), np.zeros(len(new.scale)), p)
 
 
 def emptied(

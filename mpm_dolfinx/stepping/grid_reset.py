@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import joined_parts
-from mpm_dolfinx.pores.pore_water import PoreWater, changes
+from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
 from mpm_dolfinx.stepping.stage import Stage
@@ -202,9 +203,9 @@ class OnGrid(Keyed):
         old, pieces = state.pieces, self.cut.pieces
         owner = points.id.searchsorted(old.id)
         there = pressure_of(pi, bulk)
-        then = materials.pore_water(points, owner, old.fraction, owner)
-        now = materials.pore_water(points, pieces.point, pieces.fraction, pieces.point)
-        more = changes(then, old.pressure, now, there)
+        then = materials.pore_water(points, itemgetter(owner), old.fraction, owner)
+        now = materials.pore_water(points, itemgetter(pieces.point), pieces.fraction, pieces.point)
+        more = now.changes(there, then, old.pressure)
         if state.stay:
             more = np.where(state.stay.keeps, 0.0, more)
         return self.cut.pieces_to_cells(there + more[pieces.point])
@@ -403,11 +404,8 @@ class OnGrid(Keyed):
         materials, cut = self._materials, self.cut
         if materials.retentions is None:
             return None
-        volume = cut.shares(points.volume0 * points.J)
-        store, pores = (volume * cut.to_cells(values(points)) for values in (materials.storage, materials.porosity))
-        rows = cut.to_cells(materials.retention_rows(points))
-        slot = self.contents.slot(cut.cells)
-        return PoreWater(partial(materials.saturations, rows), slot, store, pores, self._storage.bulk, self.scale)
+        volume, slot = cut.shares(points.volume0 * points.J), self.contents.slot(cut.cells)
+        return materials.pore_water(points, cut.to_cells, volume, slot, self.scale)
 
     @property
     def heads(self) -> NDArray[np.float64]:
@@ -419,10 +417,8 @@ class OnGrid(Keyed):
         """Suctions (Pa) at which filled owned cells drain, at most 1 / `TINY`.  None in saturated scenes."""
         if self._materials.retentions is None:
             return None
-        scale = np.full(len(self.contents.filled), np.inf)
-        of_points = self._materials.retention_scale(self.cut.points)
-        np.minimum.at(scale, self.contents.slot(self.cut.cells), self.cut.to_cells(of_points))
-        return np.minimum(scale, 1 / TINY)
+        slot = self.contents.slot(self.cut.cells)
+        return self._materials.scales(self.cut.points, self.cut.to_cells, slot, len(self.contents.filled))
 
     def resting_mobility(self) -> Mobility:
         """Return the conductivities (m/s) of filled owned cells in the reference configuration, as a `Mobility`."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 from mpi4py import MPI
 
@@ -38,7 +39,6 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
-from mpm_dolfinx.pores.pore_water import changes
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
@@ -167,14 +167,15 @@ class Renewal:
         brings = brought(potential)
         even = over(brings, volume) / over(share, volume)
         if rest is not None:  # heads are not linear in the content, which is conserved
-            there, owner = pressure_of(potential + pieces.x @ rest, bulk), points.id.searchsorted(old.id)
-            then = materials.pore_water(points, owner, old.fraction, owner)
-            now = materials.pore_water(points, pieces.point, pieces.fraction, pieces.point)
-            there += changes(then, old.pressure, now, there)[pieces.point]
-            held = materials.pore_water(points, pieces.point, 1.0, np.arange(len(there))).of_cells(there)
+            p, owner = pressure_of(potential + pieces.x @ rest, bulk), points.id.searchsorted(old.id)
+            then = materials.pore_water(points, itemgetter(owner), old.fraction, owner)
+            at_pieces = itemgetter(pieces.point)
+            now = materials.pore_water(points, at_pieces, pieces.fraction, pieces.point)
+            p += now.changes(p, then, old.pressure)[pieces.point]
+            held = materials.pore_water(points, at_pieces, 1.0, np.arange(len(p))).of_cells(p)
             held = over(brought(held), volume)
             middle = means_of_rows(group, new_volume, made.x, count)
-            water = materials.pore_water(made, np.arange(len(made)), new_volume, group)
+            water = materials.pore_water(made, np.asarray, new_volume, group)
             head = (made.x - middle[group]) @ rest
             return water.level(held, even + middle @ rest, head)[group] + head
         store = materials.storage(points) * volume

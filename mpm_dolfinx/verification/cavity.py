@@ -10,14 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_banded
 
 from mpm_dolfinx.base.tolerances import ITERATIONS, SAME
-from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
 from mpm_dolfinx.materials.skeleton import Skeleton
 
@@ -31,8 +28,7 @@ class _Rings:
         law = type(material)
         values = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         start = {name: np.asarray(v, dtype=float) for name, v in (dict(law.state) | dict(state or {})).items()}
-        grid = Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
-        self._law = LawAtPoints(grid, law, {name: v.shape for name, v in (values | start).items()})
+        self._law = LawAtPoints(None, law, {name: v.shape for name, v in (values | start).items()})
         self._values, self.start = _tiled(values, count), _tiled(start, count)
 
     def _data(self, stretches: NDArray[np.float64], state: State, repeat: int = 1):

@@ -8,15 +8,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ITERATIONS, ROUND_OFF
 from mpm_dolfinx.base.validation import instance, numbers, whole
-from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
 from mpm_dolfinx.materials.skeleton import DRIED, Skeleton
 from mpm_dolfinx.pores.retention import chi_at
@@ -197,7 +194,7 @@ class _Point:
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
         self._rest |= {name: np.asarray(suction) for name in DRIED if name in law.state}
         shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
-        self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size=cell_size)
+        self._law = LawAtPoints(None, law, shapes, cell_size=cell_size)
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
