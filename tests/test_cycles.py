@@ -275,7 +275,7 @@ def test_what_a_cycle_leaves_does_not_depend_on_the_axes_or_the_unit_of_length(s
 SAND = mpm.DruckerPrager(bulk=8.3e6, shear=3.8e6, cohesion=1e3, friction=0.5, dilation=0.0, conductivity=1e-5)
 
 
-@pytest.mark.parametrize(("dim", "fluid"), [(2, None), (2, mpm.Fluid()), (3, None)])
+@pytest.mark.parametrize(("dim", "fluid"), [(2, None), (2, mpm.Fluid()), pytest.param(3, None, marks=pytest.mark.slow)])
 def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(dim, fluid):
     """The strength equals the stress of a rotation by 2 degrees in linearised strain."""
     grid = mpm.Grid([0] * dim, [1.6] * dim, [8] * dim)

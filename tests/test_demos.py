@@ -71,7 +71,7 @@ QUICK = {
 }
 # what they show has tests of its own, or takes long to compile
 LONG = {"slump", "water_table", "cavity", "footing", "slope", "image", "falling", "landslide", "vibration", "wave"}
-LONG |= {"collapse", "cone"}
+LONG |= {"collapse", "cone", "shaking", "barrier", "penetration", "cycles", "dam", "small_steps", "indentation"}
 
 
 def run(demo, arguments):

@@ -79,7 +79,7 @@ def two_layers(*materials, dim=2):
         lambda: two_layers(skeleton(0.49), SOFT),
         lambda: two_layers(SOFT, SAND),
         lambda: two_layers(skeleton(0.49), SAND),
-        lambda: two_layers(skeleton(0.49), SOFT, dim=3),
+        pytest.param(lambda: two_layers(skeleton(0.49), SOFT, dim=3), marks=pytest.mark.slow),
         lambda: two_layers(Fibrous(bulk=2e8, shear=1e7), SAND),
     ],
     ids=[

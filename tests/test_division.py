@@ -118,7 +118,10 @@ def test_division_carries_the_accuracy_of_fine_cells_along(fluid):
     assert (errors[2] < 0.04).all() and (errors[2][:2] < 0.4 * errors[1][:2]).all()
 
 
-@pytest.mark.parametrize("press", [partial(pressed, loaded=False), pressed_in_3d], ids=["2D", "3D"])
+PRESSES = partial(pressed, loaded=False), pytest.param(pressed_in_3d, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("press", PRESSES, ids=["2D", "3D"])
 def test_forces_and_fluid_are_in_balance(press):
     """In each step, below a rough disc or ball that rotates and sinks into the soil."""
     s, replaced = press(), 0

@@ -428,7 +428,7 @@ def flying(dim):
     return mpm.Simulation(grid, bodies, [STIFF], inertia=mpm.Moving(velocity), numerics=tight, **scene)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_bodies_and_tools_that_strike_in_flight_keep_their_momentum(dim):
     """In 3D a free tool that touched a body raised an error of numpy."""
     s, up = flying(dim), np.eye(dim)[-1]

@@ -178,7 +178,7 @@ def test_the_first_solve_of_a_step_leaves_little_of_both_residuals_whatever_give
         assert max(report.history[0]) > 100 and max(report.history[1]) < 0.5 and report.newton <= 8
 
 
-@pytest.mark.parametrize("bulk", [50e6, 500e6])
+@pytest.mark.parametrize("bulk", [pytest.param(50e6, marks=pytest.mark.slow), 500e6])
 def test_nearly_incompressible_bodies_in_3d_take_few_iterations_a_solve(bulk):
     """nu = 0.49 and 0.499. With multigrid alone, the second takes 60 iterations per solve."""
     report = pushed(bulk).reports[1]
@@ -204,6 +204,7 @@ def test_yielding_soil_takes_few_iterations_without_factors(monkeypatch):
     assert max(counts) <= 20 and not made and np.abs(s.points.data["plastic"] - np.eye(3)).max() > 0.02
 
 
+@pytest.mark.slow
 def test_sweeps_replace_incomplete_factors_in_nearly_incompressible_soil_and_solve_the_same_problem(monkeypatch):
     stiff, ends = replace(FRICTIONAL, bulk=50e6), []
     for most in (THRESHOLDS.fallback_3d, 0):

@@ -97,6 +97,7 @@ def cut(deep, far=None, shear=5e6):
     return mpm.Simulation(grid, bodies, materials, walls=walls, gravity=(0, -9.81), conditions=[side])
 
 
+@pytest.mark.slow
 def test_a_separate_body_that_stands_does_not_change_the_factor():
     """Earlier, its stress changed the viscosity of the trials, and its motion was part of the overload."""
     safety = mpm.factor_of_safety

@@ -144,7 +144,7 @@ def test_a_block_stays_at_rest_between_quiet_sides():
     assert np.abs(s.points.x - settled).max() < 5e-3 * depth and speed(s) < 1e-5
 
 
-@pytest.mark.parametrize("kind", ["3D", "axisymmetry"])
+@pytest.mark.parametrize("kind", [pytest.param("3D", marks=pytest.mark.slow), "axisymmetry"])
 def test_quiet_bases_bear_what_they_bore_in(kind):
     """A column settles under its weight, and is then put on a quiet base, as in plane strain."""
     n, d = 8, 3 if kind == "3D" else 2
