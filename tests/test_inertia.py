@@ -153,6 +153,25 @@ def test_velocities_that_the_nodes_do_not_represent_vanish_in_a_body_without_def
     assert end[0] == pytest.approx(start[0], abs=1e-14) and end[2] < 0.4 * start[2]
 
 
+def test_a_body_that_flies_far_away_changes_no_velocities_of_points_that_keep_their_pieces():
+    """Earlier, the limit of `Mass.carried` acted on a body at rest only if another body moved."""
+    grid = mpm.Grid([0, 0], [2.0, 1.0], [8, 4])
+    dust = Dust(bulk=1.0, shear=1.0, grain_density=2.0, porosity=0.5)
+    bodies = [mpm.box(grid, [0.1, 0.3], [0.6, 0.8]), mpm.box(grid, [1.2, 0.2], [1.7, 0.7])]
+    noise = 1e-4 * np.random.default_rng(1).normal(size=(len(bodies[0]), 2))
+    found = []
+    for speed in (0.0, 0.3):
+        fly = mpm.Moving(lambda x, speed=speed: speed * (x[:, :1] > 1) * [1.0, 0.0])
+        s = mpm.Simulation(grid, bodies, [dust], walls={}, inertia=fly, numerics=TIGHT)
+        velocity = s.state.points.data[inertia.VELOCITY].copy()
+        velocity[: len(noise)] += noise
+        points = replace(s.state.points, data=s.state.points.data | {inertia.VELOCITY: velocity})
+        s.state = replace(s.state, points=points)
+        s.step(1e-2)
+        found.append(s.points.data[inertia.VELOCITY][: len(noise)])
+    assert found[1] == pytest.approx(found[0], abs=1e-12)
+
+
 @pytest.mark.parametrize("thin", [1e-3, 0.05])
 def test_nearly_empty_cells_rest_after_long_steps_that_follow_short_ones(thin):
     """In long steps the predictor of a vibration is large.  The ghost penalty must not impose its kinks."""

@@ -537,6 +537,11 @@ def test_polygons_are_cut_and_divided():
         x = np.roll(sliver * [2 * sign - 1, 1], k, axis=0)[None, :: 2 * sign - 1]
         (found,) = Polygons.rings(x).simplified(1e-3).x * [2 * sign - 1, 1]
         assert found[np.argsort(found[:, 1])] == pytest.approx(np.array([[0, 5e-5], [1, 0.3], [1, 0.9]]), abs=1e-15)
+    trapezoid = np.array([[0.0, 0.0], [0.1, 0.0], [0.4, 1.0], [0.0, 1.0], [0.0, 0.9]])
+    for k, sign in np.ndindex(5, 2):  # earlier, mirror images were divided along other diagonals, of equal areas
+        x = np.roll(trapezoid * [2 * sign - 1, 1], k, axis=0)[None, :: 2 * sign - 1]
+        widths = np.ptp(Polygons.rings(x).quadrilaterals()[1][:, :, 0], axis=1)
+        assert sorted(widths) == pytest.approx([0.1, 0.4])
     other = np.array([[[1.0, -1.0], [3, 1], [1, 3], [-1, 1]]])
     within = ring.within(other)
     row, quads, _ = within.quadrilaterals()

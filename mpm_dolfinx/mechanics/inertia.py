@@ -341,7 +341,8 @@ class Mass:
         `points`: material points at the start of the step.
         `velocities`: velocities of the unknowns, in m/s, at the start and at the end of the step.
         `rate`, in 1/s^2: see `Inertia`.
-        `moved` (n,): motion of the points in the step, in cell sizes.  None: all points keep their pieces.
+        `moved` (n,): motion of the points in the step, in cell sizes, or 0 for points that keep their pieces.  None:
+        all points keep them.
         `parts`: index (n,) of the connected part of each point, and the number of parts.
         """
         start, end = velocities
@@ -353,7 +354,7 @@ class Mass:
             unseen = {name: rest.data[name] - projected[name] for name in projected}
             after = replace(points, data=points.data | {name: seen[name] + change[name] for name in seen})
             excess = self._excess(replace(points, data=points.data | unseen), after, *parts)
-            k = np.maximum(-np.expm1(-RELAXES * moved), excess)
+            k = np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0)  # others keep their pieces
             for name, values in unseen.items():
                 out[name] -= k.reshape(-1, *[1] * (values.ndim - 1)) * values
         return out

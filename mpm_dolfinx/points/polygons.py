@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.grid.grid import means_of_rows
 
 NONE = -1
@@ -135,18 +136,18 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Divide polygons with more than four vertices into two parts."""
+        """Divide polygons with more than four vertices into two parts, the smaller of which is as large as possible.
+
+        If several divisions are equal, as by both diagonals of a trapezoid, the one with the shortest cut is chosen.
+        """
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
-        whole, best = self.area, None
-        for first in range(3 if n == 6 else n):  # opposite first vertices divide hexagons alike
-            rolled = np.roll(self.x, -first, axis=1)
-            area = Polygons.rings(rolled[:, :size]).area
-            least = np.minimum(area, whole - area)
-            if best is None:
-                best, start = least, np.zeros(len(whole), dtype=np.int64)
-            start = np.where(least > best, first, start)
-            best = np.maximum(least, best)
+        firsts = range(3 if n == 6 else n)  # opposite first vertices divide hexagons alike
+        parts = np.array([np.roll(self.x, -first, axis=1)[:, :size] for first in firsts])
+        area = np.array([Polygons.rings(one).area for one in parts])
+        least, length = np.minimum(area, self.area - area), ((parts[:, :, -1] - parts[:, :, 0]) ** 2).sum(axis=2)
+        even = least >= least.max(axis=0) - SAME * self.area  # otherwise rounding would choose
+        start = np.where(even, length, np.inf).argmin(axis=0)
         order = (start[:, None] + np.arange(n)) % n
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)
         part, rest = edge[:, :size].copy(), edge[:, [0, *range(size - 1, n)]]
