@@ -62,10 +62,12 @@ def test_step_refuses_a_jump_within_the_step(rate):
     assert s.outcome("rained")["rain_top"] == pytest.approx(2e-6, rel=1e-9)
 
 
-def test_step_takes_a_step_that_ends_at_a_jump_up_to_rounding():
-    s = block([mpm.Rain("top", steps(0, 1e-6, at=0.3))], **WET)
+@pytest.mark.parametrize("rate", [steps(0, 1e-6, at=0.3), lambda t: 1e-6 * (t > 0.3)], ids=["stepwise", "function"])
+def test_step_takes_a_step_that_ends_at_a_jump_up_to_rounding(rate):
+    """Earlier, the third step used the value of a function after its jump: 15 % too much rain."""
+    s = block([mpm.Rain("top", rate)], **WET)
     for _ in range(5):
-        s.step(0.1)  # the third step ends at 0.30000000000000004 s
+        s.step(0.1)  # without rounding, the third step would end at the jump, not at 0.30000000000000004 s
     assert s.outcome("rained")["rain_top"] == pytest.approx(0.4e-6, rel=1e-9)
 
 

@@ -108,12 +108,17 @@ def before_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], sta
     return end
 
 
-def check_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], t: float, dt: float) -> None:
-    """Raise ValueError if a function jumps within the step from t (s), of length dt (s)."""
-    before = before_jumps(functions, t, t + dt) - t
+def up_to_jumps(functions: Iterable[Stepwise | Callable[[float], NDArray]], t: float, dt: float) -> float:
+    """Return the length of the step from t (s): `dt` (s), or a number that differs by rounding and ends before a jump.
+
+    Raises ValueError if a function jumps within the step.
+    """
+    end = before_jumps(functions, t, t + dt)
+    before = end - t if end < t + dt else dt
     if dt - before > ROUND_OFF * max(abs(t), abs(t + dt)):
         what = f"step: dt = {dt!r} s from t = {t!r} s: a value jumps within the step"
         raise ValueError(f"{what}, must be at most {before!r} s, so that the step ends at the jump")
+    return before
 
 
 def _jump(of: Callable[[float], NDArray], low: float, high: float, near: float) -> float | None:

@@ -336,7 +336,7 @@ class Simulation:
         ValueError
             A function of time returns an invalid value, or jumps within the step (see `Stepwise`).
         """
-        self._state.stage.check_jumps(self._state.t, dt)
+        dt = self._state.stage.up_to_jumps(self._state.t, dt)
         distribute(self)
         self._state, report = self.advanced(dt)
         return report

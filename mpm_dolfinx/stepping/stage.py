@@ -30,7 +30,7 @@ from mpm_dolfinx.conditions.conditions import (
     Tied,
     Traction,
 )
-from mpm_dolfinx.conditions.jumps import before_jumps, check_jumps, functions_of_time, motions
+from mpm_dolfinx.conditions.jumps import before_jumps, functions_of_time, motions, up_to_jumps
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.conditions.walls import fixed_corners, fixed_nodes, with_axis
@@ -150,10 +150,9 @@ class Stage:
         sudden = any(value.jumps(t) for one in self.given.values() for value in motions(one))
         return dt if end == t + dt else end - t, sudden
 
-    def check_jumps(self, t: float, dt: float) -> None:
-        """Raise ValueError if a function of time jumps within the step from t (s), of length dt (s)."""
-        if self._functions_of_time:
-            check_jumps(self._functions_of_time, t, dt)
+    def up_to_jumps(self, t: float, dt: float) -> float:
+        """Return the length of the step from t (s), see `jumps.up_to_jumps`."""
+        return up_to_jumps(self._functions_of_time, t, dt) if self._functions_of_time else dt
 
     def check_motions(self, t: float) -> None:
         """Raise ValueError if a displacement of a stage with inertia jumps after the time `t`, in s."""
