@@ -45,7 +45,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
-from mpm_dolfinx.base.tolerances import EPSILON, SAME
+from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
@@ -112,6 +112,8 @@ class StorageForms:
         self.p, self.p_n = pressure.now, pressure.start
         self.p_before = pressure.before
         self.bulk = bulk = materials.fluid.bulk
+        self.rounding = ROUND_OFF * bulk if np.isfinite(bulk) else 0.0
+        """Rounding error of pressures, in Pa, in bodies that fly without stress."""
         retentions, laws = materials.retentions, materials.conductivity_laws
         Q = self.p.function_space
         self.conductivity = None

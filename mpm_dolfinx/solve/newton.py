@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged, Report
-from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.flow.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -190,9 +189,8 @@ def note_pressures(
     changes = storage.fill * np.abs([p - start, first, second])
     report.change, report.first, second, *ends = of_bodies(owned, np.concatenate([changes, [-start, start, -p, p]]))
     report.extremes = np.reshape(ends, (2, 2, -1)) * [[-1.0], [1.0]]
-    rounding = ROUND_OFF * forms.bulk if np.isfinite(forms.bulk) else 0.0  # in bodies that fly without stress
-    some = report.first > rounding
-    report.sudden = np.where(some & (len(rates) > 1) & (second < SUDDEN * report.first), report.first, 0.0)
+    least = np.maximum(second / SUDDEN, forms.rounding)
+    report.sudden = np.where((len(rates) > 1) & (report.first > least), report.first, 0.0)
 
 
 class Newton:
