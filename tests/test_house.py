@@ -8,7 +8,7 @@ import ways
 CEILINGS = {
     "ad hoc named numbers": 53,
     "rules among numbers in functions": 3,
-    "imports a file, mean": 5.55,
+    "imports a file, mean": 5.54,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
@@ -17,7 +17,7 @@ CEILINGS = {
     "changes of hidden state": 0,
     "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
-    "lines of the package": 40854,
+    "lines of the package": 40863,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}
