@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
-from mpm_dolfinx.conditions.conditions import resistance
+from mpm_dolfinx.conditions.conditions import holding, resistance
 from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
@@ -72,8 +72,9 @@ class Touching(Acting):
         self.symmetric = not any(self._frictional)
 
     def _stiffness(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the reference modulus, in Pa, and the density, in kg/m^3, of each point, as columns (n, 2)."""
-        return np.column_stack([self._materials.table(points, resistance), self._materials.present_density(points)])
+        """Return `resistance` and `holding`, in Pa, and the density, in kg/m^3, of each point, as columns (n, 3)."""
+        moduli = [self._materials.table(points, of) for of in (resistance, holding)]
+        return np.column_stack([*moduli, self._materials.present_density(points)])
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the initial contact pressures and shear tractions of n points, all zero."""
@@ -170,10 +171,11 @@ class ContactProblem(Loads):
         return self.still
 
     def closed(self, at: At) -> NDArray[np.bool_]:
-        """Return which pairs (m,) are closed: their gap is at most `DEPTH` cells, and their contact conducts fluid."""
+        """Return which pairs (m,) of contacts that conduct fluid are closed: pressed, or gap <= `DEPTH` cells."""
         conducts = np.array([contact.conducts for contact in self.now.law.contacts])
-        gap, pairs = self.found(at).at.gap, self.pairs
-        return conducts[pairs.number] & (gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
+        found, pairs = self.found(at), self.pairs
+        touches = (found.touch.push > 0) | (found.at.gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
+        return conducts[pairs.number] & touches
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Subtract the contact forces at u from the residual."""
@@ -206,11 +208,8 @@ class ContactProblem(Loads):
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
-        together = scipy.sparse.identity(m)
-        if self.now.law.frictional:
-            all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
-            together = all_of.T @ all_of
-        all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
+        all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
+        all_of = scipy.sparse.kron(all_of.T @ all_of, np.ones((d, d)), format="csr")
         B = at_nodes(grid, unknowns, grid.locals[cell], np.ones((m, 2 ** (d + 1))), other)
         return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
