@@ -10,9 +10,9 @@ form a *condition*.  At a pair with gap g, the contact pressure p is
 
     p = lambda - k g_m - k_s (g - g_m)
 
-with the mean gap g_m.  For elastic bodies, k_s equals the penalty stiffness k.  Pairs of soils that yield have a lower
-stiffness k_s, see `holding`, because a cell of a nearly incompressible body can meet only one condition, and several
-lock it.  The pressures derive from a convex energy.  Each condition has one multiplier lambda.  In the first
+with the mean gap g_m.  For elastic bodies, and between groups, k_s equals the penalty stiffness k.  Tools on soils that
+yield have a lower stiffness k_s, see `holding`, because several conditions lock a cell of nearly incompressible soil.
+The pressures derive from a convex energy.  Each condition has one multiplier lambda.  In the first
 iteration, lambda is the pressure after the previous step.  Augmentation (Uzawa's method) updates lambda until the
 penetrated volume in each cell is below `DEPTH` cell volumes.
 

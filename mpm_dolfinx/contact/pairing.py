@@ -148,7 +148,7 @@ class Contacts(Touching):
             if self.contacts[number].frictional:
                 old = _rotated(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
-            stiffness = np.minimum(own[at], now.stiffness[other]) * [1.0, 1.0, place.rate]
+            stiffness = np.minimum(own[at], now.stiffness[other])[:, [0, 0, 2]] * [1.0, 1.0, place.rate]
             serial = (i + grid.comm.rank * len(self._faces)) * PLACES + row
             outward = patches.area(points)[row] if self.conducts else np.zeros((len(row), 0))
             fixed = np.full((len(row), 2), [number, sign])

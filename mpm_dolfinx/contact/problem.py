@@ -171,11 +171,10 @@ class ContactProblem(Loads):
         return self.still
 
     def closed(self, at: At) -> NDArray[np.bool_]:
-        """Return which pairs (m,) of contacts that conduct fluid are closed: pressed, or gap <= `DEPTH` cells."""
+        """Return which pairs (m,) are closed: their gap is at most `DEPTH` cells, and their contact conducts fluid."""
         conducts = np.array([contact.conducts for contact in self.now.law.contacts])
-        found, pairs = self.found(at), self.pairs
-        touches = (found.touch.push > 0) | (found.at.gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
-        return conducts[pairs.number] & touches
+        gap, pairs = self.found(at).at.gap, self.pairs
+        return conducts[pairs.number] & (gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Subtract the contact forces at u from the residual."""
@@ -208,8 +207,11 @@ class ContactProblem(Loads):
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
-        all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
-        all_of = scipy.sparse.kron(all_of.T @ all_of, np.ones((d, d)), format="csr")
+        together = scipy.sparse.identity(m)
+        if self.now.law.frictional:
+            all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
+            together = all_of.T @ all_of
+        all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
         B = at_nodes(grid, unknowns, grid.locals[cell], np.ones((m, 2 ** (d + 1))), other)
         return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
