@@ -192,7 +192,8 @@ def draw(o: Namespace, heaps: dict[float, Heap]) -> None:
     work = e["external"][-1]
     names = {"external": "work of the weight", "dissipated": "lost to friction", "viscous": "viscous"}
     for name, label in {**names, "kinetic": "kinetic"}.items():
-        energy.plot(t * np.sqrt(GRAVITY / a), e[name] / work, lw=1.2, label=label)
+        style = "--" if name == "kinetic" else "-"
+        energy.plot(t * np.sqrt(GRAVITY / a), e[name] / work, style, lw=1.2, label=label)
     total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["viscous"]
     energy.plot(t * np.sqrt(GRAVITY / a), total / work, "k:", lw=1, label="sum of all but the work")
     energy.set(xlabel=r"$t\,\sqrt{g/H}$", ylabel="energy / work", title=f"Energies, $a$ = {a:g}")

@@ -12,9 +12,11 @@ form a *condition*.  At a pair with gap g, the contact pressure p is
 
 with the mean gap g_m.  For elastic bodies, and between groups, k_s equals the penalty stiffness k.  Tools on soils that
 yield have a lower stiffness k_s, see `holding`, because several conditions lock a cell of nearly incompressible soil.
-The pressures derive from a convex energy.  Each condition has one multiplier lambda.  In the first
-iteration, lambda is the pressure after the previous step.  Augmentation (Uzawa's method) updates lambda until the
-penetrated volume in each cell is below `DEPTH` cell volumes.
+The pressures derive from a convex energy.
+
+Each condition has one multiplier lambda.  In the first iteration, lambda is the pressure after the previous step.
+Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below `DEPTH` cell volumes.
+Below tools on soils that yield, single pairs may be deeper, by p / k_s.
 
 With inertia, k contains the part k_i = `STIFF` rho h / (GAMMA dt)^2, which resists only the motion in the step.  The
 term k g is then k g - k_i min(0, g_0), with the gap g_0 at the start of the step.  Otherwise a short step would remove
