@@ -68,9 +68,9 @@ def cycled(far=None, load=54e3, wet=True):
     return (p.volume0 * (p.J - 1 + 0.4 / 2.2e9 * p.pressure))[:count].sum() / 0.3, of_beam(s, count)
 
 
-def same(one, other):
+def same(one, other, within=1e-8):
     for values, values0 in zip(one, other, strict=True):
-        assert values == pytest.approx(values0, rel=0, abs=1e-8 * np.abs(values0).max())
+        assert values == pytest.approx(values0, rel=0, abs=within * np.abs(values0).max())
 
 
 @pytest.mark.parametrize("far", FAR)
@@ -85,8 +85,11 @@ def test_a_sealed_beam_does_not_see_a_body_far_away(far):
 
 @pytest.mark.parametrize("wet", [True, False], ids=["wet", "dry"])
 def test_a_beam_that_hardly_moves_stays_cut_beside_a_body_that_moves(wet):
-    """Domains are cut anew in each part separately. Cutting all parts at once changed residual stresses by 4e-4."""
-    same(cycled("moving", 5.4, wet)[1], cycled("resting", 5.4, wet)[1])
+    """Domains are cut anew in each part separately. Cutting all parts at once changed residual stresses by 4e-4.
+
+    Residual stresses of the dry beam are 1e-5 of the largest stress, so rounding errors are up to 1e-7 of them.
+    """
+    same(cycled("moving", 5.4, wet)[1], cycled("resting", 5.4, wet)[1], 1e-8 if wet else 1e-6)
 
 
 def test_a_checkpoint_knows_which_parts_stay(tmp_path):

@@ -129,11 +129,13 @@ class ContactLaw:
         self.strength = strength[key // self.grid.num_local]
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
-        resistance = self.mean(pairs.resistance)
-        self._modulus, self._hold = STIFF / h * resistance, GRIP / h * resistance
         inertial = STIFF * of_pairs * pairs.inertia
         stiffness = STIFF / of_pairs * pairs.resistance + inertial
-        self._stiffness, self._share = self.mean(stiffness), self.mean(pairs.holding) / np.maximum(resistance, TINY)
+        resistance, holding, self._stiffness = self.mean(np.array([pairs.resistance, pairs.holding, stiffness]).T).T
+        self._modulus, self._hold = STIFF / h * resistance, GRIP / h * resistance
+        self._share = holding / np.maximum(resistance, TINY)
+        self._of_pairs = (self._stiffness * self._share)[self.of]
+        self._rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         self._sunk = np.where(inertial > 0, pairs.sunk, 0.0)
         self._kept = inertial / stiffness * self._sunk
         self.frictional = any(contact.frictional for contact in contacts)
@@ -154,13 +156,13 @@ class ContactLaw:
 
     def pair_stiffness(self, state: ContactState) -> NDArray[np.float64]:
         """Return the stiffness k_s (m,), in Pa/m, of the pairs."""
-        return (self.stiffness(state) * self._share)[self.of]
+        return state.updates[self.of, 0] * self._of_pairs
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
         """Return the contact forces on the pairs, and the derivatives of these forces."""
         push, touches, joint = self._pressures(state, at.gap)
         on = np.zeros(len(self.area), dtype=bool)
-        if not touches.any():
+        if joint is None:
             grip = np.zeros((len(on), self.grid.dim, self.grid.dim))
             none, rows = grip[:, 0, 0], grip[:, 0]
             return Touch(push[:, None] * at.n, push, push, none, none, on, rows, rows, none, grip, rows)
@@ -173,21 +175,23 @@ class ContactLaw:
         force = self.pairs.area[:, None] * (push[:, None] * at.n + shear[self.of])
         return Touch(force, push, self.pair_stiffness(state) * touches, joint, pressure, *friction)
 
-    def _pressures(self, state: ContactState, gap: NDArray) -> tuple[NDArray, NDArray[np.bool_], NDArray]:
-        """Return the pressures (m,) at gaps (m,), whether each pair (m,) touches, and `Touch.joint` (k,)."""
+    def _pressures(self, state: ContactState, gap: NDArray) -> tuple[NDArray, NDArray[np.bool_], NDArray | None]:
+        """Return pressures (m,) at gaps (m,), which pairs (m,) touch, and `Touch.joint` (k,), or None without touch."""
         of, area = self.of, self.pairs.area
         k = len(self.area)
         more, parted = 1 / np.maximum(self._share, TINY) - 1, self.area
         at = self.pair_stiffness(state) * (gap - self._kept)
         bears, push = np.zeros(len(gap), dtype=bool), state.pressure / (1 + more)  # lambda + q if no pair touches
-        while (new := (at < push[of]) & ~bears).any():  # Newton's method; lambda + q increases, so no pair parts
+        # Newton's method; lambda + q increases, so no pair parts
+        while np.logical_or.reduce(new := (at < push[of]) & ~bears):
             bears |= new
             parted = sum_by(of, area * ~bears, k)
             q = -more * (sum_by(of, area * bears * at, k) + parted * state.pressure)
             push = state.pressure + q / np.maximum(self.area + more * parted, TINY)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
-        rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
-        touches = bears | (gap - self._sunk <= rounding)
+        touches = bears | (gap - self._sunk <= self._rounding)
+        if not np.logical_or.reduce(touches):
+            return np.zeros(len(gap)), touches, None
         whole = np.maximum(self.area + more * sum_by(of, area * ~touches, k), TINY)
         return bears * np.maximum(0.0, push[of] - at), touches, self.stiffness(state) * self._share * more / whole
 
