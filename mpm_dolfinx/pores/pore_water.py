@@ -48,13 +48,6 @@ class PoreWater:
         """Return the fluid contents of the cells, in m^d, from pi and `(S - 1) rho` of their pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
-    def changes(self, p: NDArray[np.float64], old: PoreWater, old_pressure: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the changes (n,) of the pressures p, in Pa, after which the cells have their earlier fluid contents.
-
-        `old`, `old_pressure`: earlier pieces of the cells, and their pressures, in Pa.
-        """
-        return self.level(old.of_cells(old_pressure), np.zeros(len(self.scale)), p)
-
     def level(
         self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:

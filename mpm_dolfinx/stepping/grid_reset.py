@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -197,15 +196,8 @@ class OnGrid(Keyed):
 
         The pore water of each point is conserved.
         """
-        materials = self._materials
-        points = self.cut.points
-        bulk = self._storage.bulk
-        old, pieces = state.pieces, self.cut.pieces
-        owner = points.id.searchsorted(old.id)
-        there = pressure_of(pi, bulk)
-        then = materials.pore_water(points, itemgetter(owner), old.fraction, owner)
-        now = materials.pore_water(points, itemgetter(pieces.point), pieces.fraction, pieces.point)
-        more = now.changes(there, then, old.pressure)
+        pieces, there = self.cut.pieces, pressure_of(pi, self._storage.bulk)
+        more = state.water_changes(self.cut.points, pieces.point, pieces.fraction, there)
         if state.stay:
             more = np.where(state.stay.keeps, 0.0, more)
         return self.cut.pieces_to_cells(there + more[pieces.point])

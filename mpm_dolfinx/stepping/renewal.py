@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import pressure_of
-from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
+from mpm_dolfinx.domains.pressure_transport import at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, PART, ROOT, SeededFaces, is_part, with_faces
 from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
@@ -129,7 +129,7 @@ class Renewal:
             order = np.argsort(np.concatenate([points.id[kept], made.id]))
             stay = Stay(rows, np.concatenate([stay.keeps[kept], np.zeros(len(made), dtype=bool)])[order])
         if pieces is not None:
-            pressure = self._pressures(pieces, points, work, made, group)
+            pressure = self._pressures(state, work, made, group)
             brought = at_start(replace(made, pressure=pressure))
             if pieces.of_cell is not None:
                 brought = replace(brought, of_cell=pressure, start=pressure)
@@ -137,13 +137,14 @@ class Renewal:
         return replace(state, points=_joined(points, made, kept), pieces=pieces, stay=stay), len(replaced)
 
     def _pressures(
-        self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
+        self, state: State, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
         """Return the pressures of the new domains: means of the old pressures, weighted by storage or volume.
 
         In unsaturated scenes, pressures are hydrostatic in each cell, and conserve the pore water of the cell.
         """
         materials, pieces = self._materials, work.pieces
+        points = state.points
         bulk = materials.fluid.bulk
         rest = None if materials.retentions is None else materials.retentions.weight.value
         piece, groups, share = work.into
@@ -162,17 +163,14 @@ class Renewal:
         def over(values: NDArray, weight: NDArray) -> NDArray:
             return sum_by(groups, values * weight[of], count)
 
-        given = old.potentials(bulk)
+        given = state.pieces.potentials(bulk)
         potential = transport(given if rest is None else given.less(rest), points, pieces)
         brings = brought(potential)
         even = over(brings, volume) / over(share, volume)
         if rest is not None:  # heads are not linear in the content, which is conserved
-            p, owner = pressure_of(potential + pieces.x @ rest, bulk), points.id.searchsorted(old.id)
-            then = materials.pore_water(points, itemgetter(owner), old.fraction, owner)
-            at_pieces = itemgetter(pieces.point)
-            now = materials.pore_water(points, at_pieces, pieces.fraction, pieces.point)
-            p += now.changes(p, then, old.pressure)[pieces.point]
-            held = materials.pore_water(points, at_pieces, 1.0, np.arange(len(p))).of_cells(p)
+            p = pressure_of(potential + pieces.x @ rest, bulk)
+            p += state.water_changes(points, pieces.point, pieces.fraction, p)[pieces.point]
+            held = materials.pore_water(points, itemgetter(pieces.point), 1.0, np.arange(len(p))).of_cells(p)
             held = over(brought(held), volume)
             middle = means_of_rows(group, new_volume, made.x, count)
             water = materials.pore_water(made, np.asarray, new_volume, group)

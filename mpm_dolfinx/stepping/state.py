@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 from mpi4py import MPI
@@ -222,6 +223,20 @@ class State:
         out = fresh.copy()
         out[keeps[point]] = values[keeps[np.searchsorted(self.points.id, self.pieces.id)]]
         return out
+
+    def water_changes(
+        self, points: MaterialPoints, point: NDArray[np.int64], fraction: NDArray[np.float64], p: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the changes (n,) of the pressures p, in Pa, of m new pieces, after which each point keeps its water.
+
+        `points`: the n present points.
+        `point`, `fraction` (m,): point of each new piece, and its fraction of the volume of the domain.
+        """
+        materials, old = self.stage.materials, self.pieces
+        owner = points.id.searchsorted(old.id)
+        then = materials.pore_water(points, itemgetter(owner), old.fraction, owner)
+        now = materials.pore_water(points, itemgetter(point), fraction, point)
+        return now.level(then.of_cells(old.pressure), np.zeros(len(points)), p)
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
         """Send points and their pieces to the processes `destination` (n,), and return the state."""
