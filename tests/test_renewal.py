@@ -308,11 +308,13 @@ def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet, inertia, rings
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
     scene, plain = layers(wet, rings).with_(inertia=inertia), Frame.plain(2)
     # with inertia, thin domains of the eighth step amplify the rounding of displacements to 1.5e-8
-    scene = scene.with_(steps=7) if inertia else scene
+    scene = scene.with_(steps=6 if wet == "above" else 7) if inertia else scene
     base = run(scene, plain)
     assert len(base[-1].place) > (1.25 if rings else 1.3) * 208
     mirrored = Frame((0, 1), (-1, 1), (1e4, -3e4), length=1e-4, stress=1e3, time=1e-3, order=3, far="resting")
     turned = Frame((1, 0), (-1, 1), (0.0, 0.0), length=1e3, stress=1e-3, time=1e3, order=5, cut=True)
+    if wet == "above" and inertia:  # a jump of the far body's pressures halves steps, also without renewal
+        mirrored = replace(mirrored, far=None)
     if rings:
         mirrored = replace(mirrored, signs=(1, -1), cells=(0.0, -3e4))
         turned = replace(turned, axes=(0, 1), signs=(1, 1))
