@@ -52,7 +52,7 @@ def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
     speeds = [0.0]
 
     def look(s: mpm.Simulation) -> None:
-        speeds.append(float(np.linalg.norm(s.points.data["velocity"], axis=1).max()))
+        speeds.append(float(np.linalg.norm(s.points.velocity, axis=1).max()))
 
     return s.run(LASTS, dt, energies=True, observe=look, progress=False), np.array(speeds)
 

@@ -140,7 +140,7 @@ def slide(o: Namespace) -> dict:
 
 def shot(s: mpm.Simulation) -> Shot:
     """Return the present state of the bank."""
-    speed = np.linalg.norm(s.points.data["velocity"], axis=1).max() if "velocity" in s.points.data else 0.0
+    speed = np.linalg.norm(s.points.velocity, axis=1).max() if "velocity" in s.points.data else 0.0
     return Shot(s.t, s.points.corners.copy(), s.point_fields().saturation, float(speed))
 
 

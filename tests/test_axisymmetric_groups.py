@@ -110,7 +110,7 @@ def test_discs_that_strike_each_other_keep_their_momentum():
     mass, momenta, forces = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J, [], []
     for _ in range(40):
         s.step(2.5e-3)
-        momenta.append(mass @ s.points.data["velocity"][:, 1])
+        momenta.append(mass @ s.points.velocity[:, 1])
         forces.append(s.tool_forces.array[0, 1])
     assert min(forces) < -1e3 and forces[-1] == 0  # they strike and part
     assert np.ptp(momenta) < 1e-12 * mass.sum()

@@ -96,7 +96,7 @@ def test_two_bars_strike_and_exchange_their_velocities(monkeypatch):
     for _ in range(round(2.6 * n)):
         s.step(1 / n)
         force.append(abs(s.tool_forces.array[0, 0]) * n / speed)
-    force, v, m = np.array(force), s.points.data["velocity"][:, 0], mass(s)
+    force, v, m = np.array(force), s.points.velocity[:, 0], mass(s)
     first = s.points.id < s.points.id.max() // 2 + 1
     left, right = (m[on] @ v[on] / m[on].sum() for on in (first, ~first))
     back = (right - left) / (2 * speed)
@@ -138,7 +138,7 @@ def test_a_block_that_rests_on_contact_stays_in_steps_of_any_length(on):
     s.stage(inertia=True)
     s.step(dt)
     wave = np.sqrt((4e5 + 4 / 3 * 2e5) / s.scene.materials.density(s.points)[0])
-    assert np.abs(s.points.data["velocity"]).max() < DEPTH * wave
+    assert np.abs(s.points.velocity).max() < DEPTH * wave
 
 
 def incline(angle, aslant, friction=0.3, speed=0.0, n=4, length=0.5):
@@ -171,7 +171,7 @@ def test_a_block_slides_down_a_rough_incline_as_fast_as_it_should(aslant):
     s.run(t, 0.02, progress=False)
     a = G * (np.sin(angle) - 0.3 * np.cos(angle))
     assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(a * t**2 / 2, rel=2e-3)
-    assert of_centre(s, s.points.data["velocity"]) @ e == pytest.approx(a * t, rel=2e-3)
+    assert of_centre(s, s.points.velocity) @ e == pytest.approx(a * t, rel=2e-3)
 
 
 @pytest.mark.parametrize("aslant", [False, True])
@@ -181,7 +181,7 @@ def test_friction_brakes_a_block_and_takes_its_energy(aslant):
     start = of_centre(s, s.points.x)
     energies = s.run(0.4, 0.02, energies=True, progress=False).energies
     assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(0.169894666, rel=2e-3)
-    assert abs(of_centre(s, s.points.data["velocity"]) @ e) < 0.02
+    assert abs(of_centre(s, s.points.velocity) @ e) < 0.02
     assert energies["friction"][-1] == pytest.approx(energies["kinetic"][0], rel=0.01) and balance(energies) < 0.01
 
 
@@ -224,7 +224,7 @@ def test_a_disc_rolls_down_an_incline_or_slips(friction):
     s.run(t, 0.01, progress=False)
     a = max(2 / 3 * G * np.sin(angle), G * (np.sin(angle) - friction * np.cos(angle)))
     assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(a * t**2 / 2, rel=0.01)
-    assert of_centre(s, s.points.data["velocity"]) @ e == pytest.approx(a * t, rel=0.01)
+    assert of_centre(s, s.points.velocity) @ e == pytest.approx(a * t, rel=0.01)
     assert spin_of(s) == pytest.approx(min(a, 2 * friction * G * np.cos(angle)) * t / radius, rel=0.01)
 
 
@@ -252,7 +252,7 @@ def test_a_soft_disc_that_slips_turns_as_theory_says():
 def spin_of(s):
     """Return the clockwise angular velocity of the whole body, rad/s."""
     m, off = mass(s), s.points.x - of_centre(s, s.points.x)
-    v = s.points.data["velocity"] - of_centre(s, s.points.data["velocity"])
+    v = s.points.velocity - of_centre(s, s.points.velocity)
     L, spread = velocity_gradients(s.points), spreads(s.points.corners, False)
     turn = off[:, 0] * v[:, 1] - off[:, 1] * v[:, 0] + (L @ spread)[:, 1, 0] - (L @ spread)[:, 0, 1]
     return -(m @ turn) / (m @ ((off**2).sum(axis=1) + np.trace(spread, axis1=1, axis2=2)))
@@ -264,7 +264,7 @@ def test_a_tool_that_pushes_ever_faster_has_its_acceleration_from_the_first_step
     paddle = mpm.Tool(mpm.HalfSpace((0.23, 0), (1, 0)), displacement=lambda t: (0.8 * t**2, 0))
     s = mpm.Simulation(grid, [block], [STIFF], walls={}, conditions=[paddle], inertia=True)
     result = s.run(0.5, 0.05, energies=True, progress=False)
-    assert of_centre(s, s.points.data["velocity"])[0] == pytest.approx(0.8, rel=5e-3)
+    assert of_centre(s, s.points.velocity)[0] == pytest.approx(0.8, rel=5e-3)
     assert result.energies["external"][-1] == pytest.approx(mass(s).sum() * 0.8**2 / 2, rel=0.01)
 
 
@@ -368,7 +368,7 @@ def test_impulses_of_tools_and_walls_are_the_changes_of_momentum():
     assert impulse[:2] == pytest.approx(lost, abs=1e-7 * np.abs(lost).max())
     assert abs(4e-3 * forces[:, 1].sum() / impulse[1] - 1) > 0.01
     held = sum(s.outcome("wall_impulse").values())
-    momentum = mass(s) @ s.points.data["velocity"]
+    momentum = mass(s) @ s.points.velocity
     assert impulse[:2] + held == pytest.approx(momentum, abs=1e-4 * np.abs(lost).max())
     s.stage(inertia=False, conditions=[])
     assert s.outcome("impulse") == {}
@@ -390,7 +390,7 @@ def test_a_resumed_strike_has_the_same_bits(tmp_path):
     for s, result in ((one, first), (other, resumed)):
         s.run(0.12, 0.02, energies=True, after=result, progress=False)
     assert np.array_equal(one.points.x, other.points.x)
-    assert np.array_equal(one.points.data["velocity"], other.points.data["velocity"])
+    assert np.array_equal(one.points.velocity, other.points.velocity)
     assert np.array_equal(one.outcome("tool_velocity").array[0], other.outcome("tool_velocity").array[0])
     assert np.array_equal(one.tool_travel.array[0], other.tool_travel.array[0])
 
@@ -404,7 +404,7 @@ def test_bars_that_drift_strike_alike(monkeypatch):
     still.step(1 / 8), moves.step(1 / 8)
     assert still.tool_forces.array[0, 0] != 0
     assert moves.tool_forces.array == pytest.approx(still.tool_forces.array, abs=1e-10)
-    slip = moves.points.data["velocity"] - still.points.data["velocity"]
+    slip = moves.points.velocity - still.points.velocity
     assert slip == pytest.approx(np.broadcast_to([2.0, 0.0], slip.shape), abs=1e-10)
 
 
@@ -435,7 +435,7 @@ def test_bodies_and_tools_that_strike_in_flight_keep_their_momentum(dim):
     mass_of = mass(s).sum() + 30.0
 
     def momentum():
-        return mass(s) @ s.points.data["velocity"] + 30.0 * s.outcome("tool_velocity")["tool"]
+        return mass(s) @ s.points.velocity + 30.0 * s.outcome("tool_velocity")["tool"]
 
     start, felt = momentum(), 0.0
     for _ in range(2):

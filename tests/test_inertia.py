@@ -49,7 +49,7 @@ def momenta(s):
     whole = mpm.Grid(s.grid.lower, s.grid.upper, [1] * d)
     spread = cut(whole, s.state.points.corners, True).second
     mass = s.scene.materials.density(points) * points.volume0 * points.J
-    v, L = points.data["velocity"], points.data["F_rate"] @ np.linalg.inv(points.F)
+    v, L = points.velocity, points.data["F_rate"] @ np.linalg.inv(points.F)
     momentum, centre = mass @ v, mass @ points.x / mass.sum()
     off, slip = points.x - centre, v - momentum / mass.sum()
     moment = np.einsum("ni,nj->nij", off, slip) + spread @ L.swapaxes(1, 2)
@@ -117,10 +117,10 @@ def test_the_ghost_penalty_does_not_act_on_a_motion_that_goes_on(size, monkeypat
     body = mpm.box(grid, [0.2] * d, np.add(0.2, size))
     velocity = lambda x: np.stack([x[:, 1] ** 2, *(0.3 * x[:, 0] ** 2 for _ in range(d - 1))], axis=1)  # noqa: E731
     s = mpm.Simulation(grid, [body], [dust], walls={}, inertia=mpm.Moving(velocity), numerics=TIGHT)
-    before = s.points.data["velocity"]
+    before = s.points.velocity
     s.step(0.05)
     assert s.scene.momentum.ghost.form.used
-    assert np.abs(s.points.data["velocity"] - before).max() < 1e-12
+    assert np.abs(s.points.velocity - before).max() < 1e-12
 
 
 def test_relaxation_hardly_damps_waves_that_the_nodes_represent():
@@ -206,7 +206,7 @@ def test_a_uniform_velocity_added_changes_nothing_else(monkeypatch):
     monkeypatch.setattr(inertia, "RELAXES", 0.0)
     still, moves = turning(drift=(0, 0)), turning(drift=(2.5, 0))
     still.step(0.1), moves.step(0.1)
-    slip = moves.points.data["velocity"] - still.points.data["velocity"]
+    slip = moves.points.velocity - still.points.velocity
     assert slip == pytest.approx(np.broadcast_to([2.5, 0.0], slip.shape), abs=1e-12)
     for _ in range(3):
         still.step(0.1), moves.step(0.1)
@@ -234,7 +234,7 @@ def flown(cells, speed=0.23, periods=1.1, amplitude=0.05, per_period=2):
     X, t = s.points.reference.mean(axis=1)[:, 0] - low, s.t
     u = speed * t + amplitude / np.pi * np.cos(np.pi * X) * np.sin(np.pi * t)
     v = speed + amplitude * np.cos(np.pi * X) * np.cos(np.pi * t)
-    off = (s.points.corners.mean(axis=1)[:, 0] - low - X - u) / (amplitude / np.pi), s.points.data["velocity"][:, 0] - v
+    off = (s.points.corners.mean(axis=1)[:, 0] - low - X - u) / (amplitude / np.pi), s.points.velocity[:, 0] - v
     return [np.sqrt((off[0] ** 2).mean()), np.sqrt((off[1] ** 2).mean()) / amplitude, abs(momenta(s)[0] - start).max()]
 
 
@@ -296,7 +296,7 @@ def test_stages_begin_and_end_inertia_with_forces_in_balance():
     assert np.abs(s.points.x - settled).max() < 1e-4 * (10 - settled.max())  # what a reset of the grid leaves
     s.stage(conditions=[mpm.Traction("top", (0, -1e4))])
     s.run(1.12, 0.01, progress=False)
-    assert np.abs(s.points.data["velocity"]).max() > 1e-3
+    assert np.abs(s.points.velocity).max() > 1e-3
     s.stage(inertia=False, conditions=[])
     s.run(2.0, 1.0, progress=False)
     assert np.abs(s.points.x - settled).max() < 1e-3 * (10 - settled.max())
@@ -329,7 +329,7 @@ def test_the_base_bears_the_same_force_before_and_after_inertia_begins(load, flu
     for _ in range(10):
         s.step(2e-3)
         assert s.wall_reactions["bottom"][1] == pytest.approx(before, rel=change)
-        assert np.abs(s.points.data["velocity"]).max() < fastest
+        assert np.abs(s.points.velocity).max() < fastest
 
 
 @pytest.mark.parametrize("held", [None, mpm.Displacement("bottom", lambda t: (0, 0.03 * min(t, 1)))])
@@ -346,13 +346,13 @@ def test_a_block_off_the_grid_lines_stays_at_rest_when_inertia_begins_and_falls_
     s.stage(inertia=True)
     for _ in range(3):
         s.step(2e-3)
-        assert np.abs(s.points.data["velocity"]).max() < 1e-6  # 2e-3 m/s without these forces
+        assert np.abs(s.points.velocity).max() < 1e-6  # 2e-3 m/s without these forces
     if held:
         s.state = settled
         s.stage(inertia=True, conditions=[])
         s.step(2e-3)
         mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
-        assert mass @ s.points.data["velocity"][:, 1] / mass.sum() == pytest.approx(-9.81 * 2e-3, rel=1e-9)
+        assert mass @ s.points.velocity[:, 1] / mass.sum() == pytest.approx(-9.81 * 2e-3, rel=1e-9)
 
 
 def test_a_block_falls_as_stones_do():
@@ -560,7 +560,7 @@ def test_a_fill_comes_at_rest():
     s = mpm.Simulation(grid, bodies, [BLOCK], walls=walls, inertia=mpm.Moving((0, 0.1)))
     s.stage(add=[1])
     fill = s.points.id >= len(bodies[0])
-    assert (s.points.data["velocity"][fill] == 0).all() and (s.points.data["velocity"][~fill, 1] == 0.1).all()
+    assert (s.points.velocity[fill] == 0).all() and (s.points.velocity[~fill, 1] == 0.1).all()
 
 
 def test_a_resumed_flight_has_the_same_bits(tmp_path):
@@ -573,7 +573,7 @@ def test_a_resumed_flight_has_the_same_bits(tmp_path):
     for s in (one, other):
         s.run(0.8, 0.1, progress=False)
     assert np.array_equal(one.points.x, other.points.x)
-    assert np.array_equal(one.points.data["velocity"], other.points.data["velocity"])
+    assert np.array_equal(one.points.velocity, other.points.velocity)
 
 
 @pytest.mark.parametrize(

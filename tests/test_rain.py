@@ -90,7 +90,7 @@ def test_a_slope_that_fails_in_a_storm_comes_to_rest_and_its_water_is_all_there(
     speeds = []
     for _ in range(8):
         s.run(s.t + 0.25, 0.025, progress=False)
-        speeds.append(np.linalg.norm(s.points.data["velocity"], axis=1).max())
+        speeds.append(np.linalg.norm(s.points.velocity, axis=1).max())
         assert water(s) - start == pytest.approx(-s.outcome("flowed").array.sum(), abs=1e-8 * start)
     assert s.outcome("ran_off")["rain"] > 0
     assert np.linalg.norm(s.points.displacement, axis=1).max() > 0.1

@@ -416,8 +416,9 @@ def test_mapped_bodies_are_not_integrated_at_points():
         (lambda: wet(lambda conductivity, J: conductivity * np.exp(J)), ValueError, "ufl.exp and the like in place of"),
         (lambda: scene(BODY), ValueError, "^bodies = a single LatticeBody, must be a list"),
         (lambda: scene().points.position, AttributeError, "'position', must be one of id, .* x, .* J, displacement"),
+        (lambda: scene().points.velocity, AttributeError, "'velocity', must be one of id, .* velocity .with inertia."),
     ],
-    ids=["Young's modulus", "numpy in a law", "a body without a list", "an unknown field of points"],
+    ids=["Young's modulus", "numpy in a law", "a body without a list", "an unknown field of points", "no inertia"],
 )
 def test_messages_tell_the_right_spelling(make, error, said):
     with pytest.raises(error, match=said):

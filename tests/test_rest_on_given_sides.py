@@ -189,5 +189,5 @@ def test_a_held_base_rests_in_short_steps_when_inertia_begins_and_its_reaction_i
         s.stage(inertia=True)
         for dt in (1e-4, 1e-8):
             s.step(dt)
-            assert s.points.data["velocity"] == pytest.approx(0, abs=1e-9)
+            assert s.points.velocity == pytest.approx(0, abs=1e-9)
             assert s.reactions.array[0, 1] == pytest.approx(weight(s), rel=0.012)

@@ -92,9 +92,9 @@ def test_a_pulse_that_leaves_on_one_side_enters_on_the_other():
 
     walls = {"bottom": "y", "top": "y"}
     s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[TIED], inertia=mpm.Moving(velocity))
-    before = s.points.data["velocity"].copy()
+    before = s.points.velocity.copy()
     s.run(width * h / C_P, h / C_P, progress=False)
-    assert s.points.data["velocity"] == pytest.approx(before, abs=0.01 * np.abs(before).max())
+    assert s.points.velocity == pytest.approx(before, abs=0.01 * np.abs(before).max())
 
 
 def test_tied_sides_are_refused_unless_they_are_opposite_and_alike():

@@ -25,7 +25,7 @@ def column(n=20, conditions=(), walls=SMOOTH, **options):
 
 
 def speed(s):
-    return np.abs(s.points.data["velocity"]).max()
+    return np.abs(s.points.velocity).max()
 
 
 def pulse(t, length=0.05):
@@ -95,7 +95,7 @@ def test_a_wave_that_comes_in_doubles_at_the_surface_and_leaves():
     top = s.points.x[:, 1].argmax()
     for _ in range(85):
         s.step(dt)
-        fastest = max(fastest, (s.points.data["velocity"][top, 1], s.t))
+        fastest = max(fastest, (s.points.velocity[top, 1], s.t))
     assert fastest == (pytest.approx(2e-2, rel=0.01), pytest.approx(0.05 + HEIGHT / C_P, abs=dt))
     assert speed(s) < 1e-3 * fastest[0]
 
@@ -180,7 +180,7 @@ def test_a_base_moves_as_it_should_and_bodies_with_it():
         ends = [s.points.x[:, 1].argmin(), s.points.x[:, 1].argmax()]
         for _ in range(steps):
             s.step(period / steps)
-            v, u = s.points.data["velocity"][ends[0], 0], s.points.displacement[ends[1], 0]
+            v, u = s.points.velocity[ends[0], 0], s.points.displacement[ends[1], 0]
             errors.append([v / w - exact[ends[0]] * np.cos(w * s.t), u - exact[ends[1]] * np.sin(w * s.t)])
         off.append(np.abs(errors).max(axis=0) / exact[ends])
     assert (off[0] < 0.012).all() and (off[0] / off[1] > 3.4).all()

@@ -77,7 +77,7 @@ def ends(s: mpm.Simulation, axis: int) -> tuple[float, float]:
     face = points.corners[i, :, axis].max()
     L = velocity_gradients(points)[i, axis, axis]
     u = face - points.origin[i, :, axis].max()
-    return float(u), float(points.data["velocity"][i, axis] + L * (face - points.x[i, axis]))
+    return float(u), float(points.velocity[i, axis] + L * (face - points.x[i, axis]))
 
 
 def against(exact: Motion, dt: float, least: float = 0.0) -> Callable[[mpm.Simulation, mpm.Result], float]:

@@ -151,7 +151,7 @@ class MaterialPoints:
         """Raise AttributeError for an unknown name.  The message lists the names of all fields."""
         if name.startswith("__") or "data" not in vars(self):  # during a copy
             raise AttributeError(name)
-        own = ", ".join([*(f.name for f in fields(self)), "J", "displacement"])
+        own = ", ".join([*(f.name for f in fields(self)), "J", "displacement", "velocity (with inertia)"])
         data = ", ".join(key for key in self.data if key not in self.INTERNAL)
         raise AttributeError(f"points: {name!r}, must be one of {own}" + f"; data has {data}" * bool(data))
 
@@ -199,6 +199,13 @@ class MaterialPoints:
     def displacement(self) -> NDArray[np.float64]:
         """Displacement (n, d), in m, of the centroids since seeding, or since a stage set displacements to zero."""
         return self.x - centroids(self.origin)
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Velocity (n, d), in m/s, of scenes with inertia.  In other scenes, AttributeError is raised."""
+        if "velocity" not in self.data:
+            raise AttributeError  # `__getattr__` writes the message
+        return self.data["velocity"]
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
         """Return the points after a function is applied to each array.
