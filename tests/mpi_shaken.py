@@ -20,7 +20,7 @@ options = {"fluid": mpm.Fluid(bulk=1e8), "walls": {}, "gravity": (0, -9.81), "in
 simulation = mpm.Simulation(grid, [block], [soil], conditions=conditions, **options)
 result = simulation.run(0.02, 0.01, energies=True, progress=False)
 points = simulation.points
-if state := gathered(simulation, p=points.pressure, velocity=points.data["velocity"]):
+if state := gathered(simulation, p=points.pressure, velocity=points.velocity):
     np.savez(
         sys.argv[1],
         **state,

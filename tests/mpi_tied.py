@@ -24,5 +24,5 @@ simulation = mpm.Simulation(
 )
 result = simulation.run(0.05, 0.01, progress=False)
 points = simulation.points
-if state := gathered(simulation, velocity=points.data["velocity"], pressure=points.pressure):
+if state := gathered(simulation, velocity=points.velocity, pressure=points.pressure):
     np.savez(sys.argv[1], **state, balance=result.balance)

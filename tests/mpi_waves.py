@@ -19,6 +19,6 @@ quiet = [mpm.Quiet(side, lambda t: (0.1 * (t - 100), 0)) for side in ("bottom", 
 simulation.stage(inertia=True, conditions=[*quiet, mpm.Drained("top")], reset_displacement=True)
 result = simulation.run(100.2, 0.05, energies=True, progress=False)
 points = simulation.points
-if state := gathered(simulation, p=points.pressure, velocity=points.data["velocity"], u=points.displacement):
+if state := gathered(simulation, p=points.pressure, velocity=points.velocity, u=points.displacement):
     energies = [of[-1] for of in result.energies.values()]
     np.savez(sys.argv[1], **state, energies=energies, balance=result.balance)

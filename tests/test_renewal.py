@@ -150,7 +150,7 @@ def momenta(s, points):
     pieces, density = cut(s.grid, points.corners, second=True), s.scene.materials.present_density(points)
     at, L = pieces.point, velocity_gradients(points)
     m, x = pieces.fraction * (density * points.volume0 * points.J)[at], pieces.x
-    v = points.data["velocity"][at] + np.einsum("nij,nj->ni", L[at], x - points.x[at])
+    v = points.velocity[at] + np.einsum("nij,nj->ni", L[at], x - points.x[at])
     turning = L[at] @ pieces.second
     spin = x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0] + turning[:, 1, 0] - turning[:, 0, 1]
     energy = (v**2).sum(axis=1) + np.einsum("nij,nij->n", turning, L[at])
@@ -177,7 +177,7 @@ def test_momentum_stays_and_a_uniform_velocity(monkeypatch, uneven):
         assert after[2] == pytest.approx(before[2], abs=1e-6)
         assert after[3] == pytest.approx(before[3], rel=energy)
     new, _ = renewed(s, replace(old, data=old.data | {"velocity": 1 + 0 * v, "F_rate": 0 * L}), monkeypatch, 0.4)
-    assert np.abs(new.data["velocity"] - 1).max() < 1e-13 and np.abs(new.data["F_rate"]).max() < 1e-12
+    assert np.abs(new.velocity - 1).max() < 1e-13 and np.abs(new.data["F_rate"]).max() < 1e-12
 
 
 def test_clay_that_flies_and_stretches_keeps_its_momentum_and_tells_its_energy():
@@ -379,7 +379,7 @@ def test_cells_of_unsaturated_soil_keep_their_water(monkeypatch, inertia):
         at_pieces = pressures[-1][on_grid.contents.slot(on_grid.cut.cells)] + on_grid.heads
         water.append(on_grid.pore_water(state.points).of_cells(at_pieces))
         if inertia:
-            momentum.append(s.scene.materials.masses(state.points) @ state.points.data["velocity"])
+            momentum.append(s.scene.materials.masses(state.points) @ state.points.velocity)
     assert pressures[0].min() < -1e3
     assert water[1].sum() == pytest.approx(water[0].sum(), rel=1e-13)
     assert water[1] == pytest.approx(water[0], abs=1e-6 * np.abs(water[0]).max())

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.mechanics.inertia import VELOCITY, velocity_gradients
+from mpm_dolfinx.mechanics.inertia import velocity_gradients
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -24,7 +24,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
     """Return the total kinetic and elastic energy of all points, in J.  All processes must call this function."""
     mass = materials.masses(points)
-    v, L = points.data[VELOCITY], velocity_gradients(points)
+    v, L = points.velocity, velocity_gradients(points)
     moments = spreads(points.corners, materials.grid.axisymmetric)
     turning = np.einsum("nij,njk,nik->n", L, moments, L)
     kinetic, elastic = mass @ ((v**2).sum(axis=1) + turning) / 2, materials.stored(points) @ points.volume0
@@ -40,7 +40,7 @@ def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bo
     """
     mass = materials.masses(points)
     held = held | (np.arange(len(held)) < materials.grid.axisymmetric)
-    sums = [[mass.sum()] * len(held), mass @ points.data[VELOCITY], held]
+    sums = [[mass.sum()] * len(held), mass @ points.velocity, held]
     total, momentum, held = over_all(materials.grid.comm, np.array(sums))
     return np.where(held > 0, 0.0, momentum / total).tolist()
 

@@ -66,7 +66,7 @@ def velocities(
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
-    v, L = points.data[VELOCITY], velocity_gradients(points)
+    v, L = points.velocity, velocity_gradients(points)
     old = Momenta.of(work.pieces, *_received(work, masses[0]), v, L, count)
     of, at, share = work.pairs(corners, group)
     weight = share * masses[0][of]

@@ -59,7 +59,7 @@ from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, s
 from mpm_dolfinx.grid.grid import corner_bits, polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
-from mpm_dolfinx.points.material_points import MaterialPoints, middle
+from mpm_dolfinx.points.material_points import RATE, VELOCITY, MaterialPoints, middle
 
 GHOST_MASS = 0.02
 """Strength c of the ghost mass.  A rotating block has the same energies with 0.002 and 0.2 (tests/test_inertia.py).
@@ -78,9 +78,6 @@ rates 0.1 and 2, and 0.86 % at 10.
 Sensitivity (scene "bar" of tests/plateaus.py): half this value changes the result by 5.2e-04, and twice this value by
 6.6e-04. Finer cells change it by 1.1e-01.
 """
-
-VELOCITY, RATE = "velocity", "F_rate"
-"""Names of point data: velocity (n, d), in m/s, at the centroid, and rate of F (n, d, d), in 1/s."""
 
 
 def resting(points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
@@ -293,7 +290,7 @@ class Mass:
         """
         cut, grid, places, (off, second, _) = self._cut, self._forms.grid, self._pieces.places, self._moments
         L = columns(velocity_gradients(points)).take(cut.pieces.point, axis=2)
-        v = points.data[VELOCITY][cut.pieces.point].T + product(L, off[:, None])[:, 0]
+        v = points.velocity[cut.pieces.point].T + product(L, off[:, None])[:, 0]
         sent = (cut.pieces_to_cells(np.moveaxis(values, -1, 0)) for values in (v, product(L, second)))
         v, turn = (self._pieces.volume * np.moveaxis(of, 0, -1) for of in sent)
         y, moments = places.offset.T, []
@@ -365,7 +362,7 @@ class Mass:
         """Return the fraction (n,) of the `unseen` velocities beyond their largest energy, see `carried`."""
         grid, volume = self._forms.grid, unseen.volume0 * unseen.J
         L, rate = (columns(velocity_gradients(of)) for of in (unseen, seen))
-        own = (unseen.data[VELOCITY] ** 2).sum(axis=1) + (product(L, self._moments[2]) * L).sum(axis=(0, 1))
+        own = (unseen.velocity**2).sum(axis=1) + (product(L, self._moments[2]) * L).sum(axis=(0, 1))
         within = ((rate**2).sum(axis=0).T * grid.sizes_at(unseen.x) ** 2).sum(axis=1) / 12
         energies = np.array([np.bincount(part, volume * of, count) for of in (own, within)])
         own, within = grid.comm.allreduce(energies)

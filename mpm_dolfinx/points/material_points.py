@@ -18,6 +18,8 @@ from mpm_dolfinx.points.cutting import centroids
 
 ACROSS = "stretch across"
 """Name of the point data with the out-of-plane stretch in plane strain, for laws with F-bar."""
+VELOCITY, RATE = "velocity", "F_rate"
+"""Names of point data: velocity (n, d), in m/s, at the centroid, and rate of F (n, d, d), in 1/s."""
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -203,9 +205,9 @@ class MaterialPoints:
     @property
     def velocity(self) -> NDArray[np.float64]:
         """Velocity (n, d), in m/s, of scenes with inertia.  In other scenes, AttributeError is raised."""
-        if "velocity" not in self.data:
+        if VELOCITY not in self.data:
             raise AttributeError  # `__getattr__` writes the message
-        return self.data["velocity"]
+        return self.data[VELOCITY]
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
         """Return the points after a function is applied to each array.

@@ -400,7 +400,7 @@ def shown(built: Built, steps: list[int]) -> Shown:
         "volume": points.J[own] - 1,
     }
     if scene.inertia:
-        fields["velocity"] = frame.vector_back(points.data["velocity"][own] * frame.time / frame.length)
+        fields["velocity"] = frame.vector_back(points.velocity[own] * frame.time / frame.length)
         if "energy" in s.state.outcome and not frame.far:
             energies = np.array(list(s.state.outcome["energy"].values()))
             fields["energies"] = energies / (frame.force(scene) * frame.length)
