@@ -351,30 +351,30 @@ class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
     2D means plane strain.  Source: Hencky (1928).  The deviatoric part contains a small constant under a square root,
-    which keeps the derivatives finite at equal eigenvalues.  The stress at F = I is exactly zero.  Parameters: see
-    `Skeleton`.
+    which keeps the derivatives finite at equal eigenvalues.  Energy and stress at F = I are exactly zero.  Parameters:
+    see `Skeleton`.
     """
 
     @staticmethod
     def energy(F, bulk, shear):
         """Return the stored energy, in Pa, as UFL."""
-        d, ln_J = F.ufl_shape[0], ufl.ln(ufl.det(F))
-        if d == 3 and planar(F):
-            return bulk / 2 * ln_J**2 + shear * _deviatoric(F)
-        C = F.T * F
-        if d == 2:
-            deviatoric = _stretch_difference(C) ** 2 / 2
-        else:
-            logs = [ufl.ln(e) / 2 for e in _eigenvalues(C / (ufl.tr(C) / d))]
-            deviatoric = sum(l**2 for l in logs) - sum(logs) ** 2 / d
-        return ((bulk - 2 * shear / 3) / 2 + shear / d) * ln_J**2 + shear * deviatoric
+        d, plane = F.ufl_shape[0], planar(F)
+        deviatoric = _deviatoric(F.T * F, plane) - _deviatoric(ufl.Identity(d), plane)
+        return (bulk / 2 + (1 / d - 1 / 3) * shear) * ufl.ln(ufl.det(F)) ** 2 + shear * deviatoric
 
 
-def _deviatoric(F):
-    """Return `sum l_i^2 - (sum l_i)^2 / 3` as UFL for the logarithmic stretches l_i."""
-    whole = F.T * F
-    C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
-    return _stretch_difference(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
+def _deviatoric(C, plane: bool):
+    """Return `sum l_i^2 - (sum l_i)^2 / d` as UFL for the logarithmic principal stretches l_i, with C = F^T F (d, d).
+
+    plane: whether the third axis is principal.
+    """
+    d = C.ufl_shape[0]
+    if plane:
+        block = ufl.as_matrix([[C[i, j] for j in (0, 1)] for i in (0, 1)])
+        across = ufl.ln(ufl.det(block)) / 2 - ufl.ln(C[2, 2]) if d == 3 else 0
+        return _stretch_difference(block) ** 2 / 2 + across**2 / 6
+    logs = [ufl.ln(e) / 2 for e in _eigenvalues(C / (ufl.tr(C) / d))]
+    return sum(l**2 for l in logs) - sum(logs) ** 2 / d
 
 
 def _stretch_difference(C):
