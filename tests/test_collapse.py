@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from collapse import BALANCE, CELLS, GRAIN, SCATTER, STEPS, collapsed, depths, published
+from collapse import BALANCE, CELLS, COARSE, GRAIN, SCATTER, STEPS, collapsed, column, depths, front, moving, published
 
 
 @pytest.mark.slow
@@ -29,3 +29,13 @@ def test_depths_are_those_of_the_domains():
     inside = (x > 0.105) & (x < 0.995)
     assert depth[inside] == pytest.approx(0.28, abs=1e-12) and x[-1] > 1.1
     assert GRAIN * depth.sum() == pytest.approx(0.28, rel=0.01)
+
+
+def test_coarse_sand_under_water_moves_as_dry_sand_under_reduced_gravity():
+    """Under the whole weight, the front would move almost twice as far in this time."""
+    fronts = []
+    for conductivity in (0.0, COARSE):
+        s, fall = column(1.0, 6, conductivity=conductivity), moving(conductivity)[1] ** -0.5
+        s.run(fall, fall / 10, progress=False)
+        fronts.append(front(*depths(s)) - 1)
+    assert fronts[1] == pytest.approx(fronts[0], rel=0.02) and fronts[0] > 0.2
