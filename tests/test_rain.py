@@ -55,6 +55,23 @@ def test_a_stage_that_ends_a_pond_says_so():
     assert s.outcome("ponded")["rain"] == 0
 
 
+def test_conditions_that_continue_keep_their_default_names():
+    """A pond stayed with the name of the condition that ended, and the message named the pond that continues."""
+    law = mpm.VanGenuchten(WATER / 3.35, residual=0.1, n=2.0)
+    soil = mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=K, retention=law)
+    drain, dry = mpm.Drained("bottom"), mpm.Rain("top", 0.0, region=([0.1, 0], [0.2, 2]))
+    wet = mpm.Rain("top", 9 * K, ponding=0.02 * WATER, region=([0, 0], [0.1, 2]))
+    s = column(10, [soil], mpm.hydrostatic(0.2), [drain, dry, wet], width=2)
+    s.run(600.0, 60.0, progress=False)
+    pond = s.outcome("ponded")["rain_top_2"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        s.stage(conditions=[drain, wet])
+    assert s.outcome("ponded")["rain_top_2"] == pond > 0
+    with pytest.warns(mpm.ConditionWarning, match="stage: rain_top_2: its pond of"):
+        s.stage(conditions=[drain])
+
+
 @pytest.mark.parametrize("retention", [True, False])
 def test_all_rain_is_stored_ponds_runs_off_or_flows_out(retention):
     """A storm fills a pond of 2 cm, and the pond then infiltrates and evaporates."""

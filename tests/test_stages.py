@@ -111,7 +111,7 @@ def test_a_condition_that_moves_on_to_what_an_excavation_lays_bare_is_named(warn
     s = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
     s.stage(remove=remove)
     (message,) = warned()
-    assert "Traction(side='top'" in message and f"on {area:.3g} m^1 of newly exposed faces" in message
+    assert "Traction(side='top'" in message and f"on {area:.3g} m of newly exposed faces" in message
     other = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
     other.stage(remove=remove, conditions=[replace(one) for one in load])
     assert not warned(), "they were given anew"

@@ -70,7 +70,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene in its first stage, before its initial stresses are balanced."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    first = scene.stage(conditions, present, later)
+    first = scene.stage(conditions, present, later, {})
     if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
             f"{next(iter(quiet))}: cannot balance initial stress, must begin in a later stage: first prescribe the side"
@@ -170,7 +170,7 @@ def _stage_after(
     present = [(is_present and body not in remove) or body in add for body, is_present in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
-    after = scene.stage({**before.conditions, **named, "conditions": conditions}, present, later)
+    after = scene.stage({**before.conditions, **named, "conditions": conditions}, present, later, before.given)
     _check_weight(after, before, state.t)
     after.check_motions(state.t)
     _warn_dammed(scene, after, state.t)
@@ -375,8 +375,9 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
         new = np.flatnonzero(was_present[now.id] & (bare[now.id] > SAME * now.whole0))
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
-            what = "stage: remove: %s is unchanged and now also acts on %.3g m^%d of newly exposed faces, first at %s"
-            values = line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0)
+            what = "stage: remove: %s is unchanged and now also acts on %.3g %s of newly exposed faces, first at %s"
+            unit = "m^2" if scene.grid.stretches == 3 else "m"
+            values = line(condition), area, unit, now.X[new[0]].mean(axis=0)
             warn(scene.grid.comm, ConditionWarning, what, *values)
 
 

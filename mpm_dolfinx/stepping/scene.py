@@ -236,13 +236,15 @@ class Scene:
         given = {**before.conditions, "conditions": tuple(before.given.values())}
         nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
         nodal = {name: self.grid.from_other(before.materials.grid, rows) for name, rows in nodal.items()}
-        after = self.stage(given, before.present, before.later)
+        after = self.stage(given, before.present, before.later, before.given)
         return replace(state, stage=after, **nodal).at_owners(self.grid)
 
-    def stage(self, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-        """Return a stage of the scene.  `conditions`, `present`, `later`: see `stepping.stage.stage`."""
+    def stage(
+        self, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int], known: Mapping[str, Any]
+    ) -> Stage:
+        """Return a stage of the scene.  Parameters: see `stepping.stage.stage`."""
         fed = self.storage.feeding if self.storage else ()
-        return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
+        return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later, known)
 
     def check(self, state: State) -> None:
         """Raise ValueError if an object is not a state of this scene."""

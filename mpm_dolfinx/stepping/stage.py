@@ -79,8 +79,10 @@ def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
     return [one for one in conditions if isinstance(one, Contact)]
 
 
-def named(conditions: Sequence[Any]) -> dict[str, Any]:
+def named(conditions: Sequence[Any], known: Mapping[str, Any]) -> dict[str, Any]:
     """Return the conditions by name.  A default name consists of type and side, and of a number if necessary.
+
+    `known`: conditions of the previous stage by name.  Conditions that continue keep their names.
 
     Raises
     ------
@@ -93,6 +95,8 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
             raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
         if name is not None and given.count(name) > 1:
             raise ValueError(f"{line(one)}: name = {line(name)} is the name of another condition, must be unique")
+    kept = {id(one): name for name, one in known.items() if name not in given}
+    given = [name or kept.get(id(one)) for name, one in zip(given, conditions, strict=True)]
     out: dict[str, Any] = {}
     for name, one in zip(given, conditions, strict=True):
         base, count = name or _default(one), 1
@@ -302,6 +306,7 @@ def stage(
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
+    known: Mapping[str, Any],
 ) -> Stage:
     """Return a stage.
 
@@ -311,6 +316,7 @@ def stage(
     `conditions`: walls, conditions, gravity and inertia: see `Simulation`.
     `present`: whether each body is present.
     `later`: indices of bodies that a later stage adds.
+    `known`: conditions of the previous stage by name, see `named`.
 
     Raises
     ------
@@ -318,7 +324,7 @@ def stage(
         A condition is invalid.
     """
     grid, fluid = materials.grid, materials.fluid
-    given_by_name = named(checked(conditions["conditions"]))
+    given_by_name = named(checked(conditions["conditions"]), known)
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
     for name, one in by_name.items():
