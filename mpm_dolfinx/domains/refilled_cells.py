@@ -136,10 +136,13 @@ class RefilledCells:
         size = self._areas / self._volume(self.cell)
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
+        folded = self._folded()
+        while (more := self._all_of(folded & self._at(excluded)) & ~excluded).any():
+            excluded |= more
         elastic = np.zeros(self.cells, dtype=bool)
         elastic[self.cell[~flowed[self.pieces.point]]] = True
         small = (size < SMALL) & ~elastic[self.cell]  # or renewal would spread through elastic soil
-        self.chosen = self._chosen(free & flowed & needs, excluded, small)
+        self.chosen = self._chosen(free & flowed & needs, excluded, small | folded[self.pieces.point])
         """Whether each cell (cells,) is renewed."""
         self.affected = self._at(self.chosen)
         """Whether each point (n,) loses its domain or a part of it."""
@@ -162,6 +165,25 @@ class RefilledCells:
         """Return which points (n,) have a piece in a cell for which `cells` (cells,) is true."""
         out = np.zeros(len(self.points), dtype=bool)
         out[self.pieces.point[cells[self.cell]]] = True
+        return out
+
+    def _all_of(self, domains: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which cells (cells,) contain a piece of the chosen domains (n,)."""
+        out = np.zeros(self.cells, dtype=bool)
+        out[self.cell[domains[self.pieces.point]]] = True
+        return out
+
+    def _folded(self) -> NDArray[np.bool_]:
+        """Return which domains (n,) are folded, with a face on the surface that no convex part has.
+
+        Such a domain is renewed in all its cells or in none, because its remainders would lose the face.
+        """
+        at, corners = self.faces.point, self.points.corners
+        parts, of = _convex(corners[at], self.grid.sizes_at(corners[at].mean(axis=1)).prod(axis=-1))
+        kept = np.zeros((len(at), 5), dtype=bool)
+        kept[of[:, None], parts.edge] = True  # the last column is that of edges inside a domain
+        out = np.zeros(len(corners), dtype=bool)
+        out[at[~kept[np.arange(len(at)), self.faces.face]]] = True
         return out
 
     def _excluded(self, free: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
