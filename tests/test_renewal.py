@@ -264,18 +264,30 @@ def test_pressures_act_on_renewed_sides_as_before(monkeypatch, rings):
     assert count and found[1] == pytest.approx(found[0], rel=2e-3, abs=1e-3)
 
 
-def test_a_folded_domain_keeps_its_faces_on_the_surface_if_only_some_of_its_cells_can_be_renewed(monkeypatch):
-    """The corner of a block is pushed into the domain below.  Without its folded part, the surface would be open."""
+@pytest.mark.parametrize("folded", [True, False])
+def test_the_surface_stays_closed_if_only_some_cells_of_a_domain_can_be_renewed(monkeypatch, folded):
+    """A corner of the block is pushed into the domain below, or the top is slightly above a grid line.
+
+    Without the folded part, or without thin parts above the grid line, the surface would be open.
+    """
     grid = mpm.Grid([0, 0], [4, 4], [4, 4])
     s = mpm.Simulation(grid, [mpm.box(grid, [0.25, 0.25], [2.75, 2.25])], [CLAY], walls={})
     old = yielded(s, 1e-3 * np.diag([1.0, -1.0]))
     corners = old.corners.copy()
-    corners[np.linalg.norm(corners - [2.75, 2.25], axis=2) < 1e-9] = [2.6, 1.7]
-    s.state = replace(s.state, watched=old.id[np.linalg.norm(old.x - [2.5, 1.5], axis=1) < 1e-9])
+    if folded:
+        corners[np.linalg.norm(corners - [2.75, 2.25], axis=2) < 1e-9] = [2.6, 1.7]
+    else:
+        corners[:, :, 1] = np.minimum(corners[:, :, 1], 2 + 1e-6)
+    stays = [2.5, 1.5] if folded else [1.5, 2.0]
+    s.state = replace(s.state, watched=old.id[np.linalg.norm(old.x - stays, axis=1) < 1e-9])
     new, count = renewed(s, replace(old, corners=corners), monkeypatch)
-    faces = SeededFaces(s.grid, s.bodies).of(new)
-    first, last = (new.corners[faces.point, FACES[2][faces.face, k]] for k in (0, 1))
+    found = []
+    for points in (replace(old, corners=corners), new):
+        faces = SeededFaces(s.grid, s.bodies).of(points)
+        first, last = (points.corners[faces.point, FACES[2][faces.face, k]] for k in (0, 1))
+        found.append(np.linalg.norm(last - first, axis=1).sum())
     assert count and len(s.state.watched) == 1
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
     assert (np.array(FACE_SIGNS)[faces.face] @ (last - first)) == pytest.approx([0, 0], abs=1e-9)
 
 

@@ -109,6 +109,7 @@ class RefilledCells:
     `faces`: surface of the bodies.
     `signs`: keys of seeded faces, and the index of the set of conditions on each of these faces.
     `second`: whether to compute second moments of the pieces.
+    `whole` (n,): whether the domains of points are renewed in all their cells or in none, see `torn`.
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class RefilledCells:
         faces: OuterFaces,
         signs: tuple[NDArray, NDArray],
         second: bool = False,
+        whole: NDArray[np.bool_] | bool = False,
     ):
         self.grid = grid
         self.points = points
@@ -136,13 +138,13 @@ class RefilledCells:
         size = self._areas / self._volume(self.cell)
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
-        folded = self._folded()
-        while (more := self._all_of(folded & self._at(excluded)) & ~excluded).any():
+        self.whole = np.broadcast_to(whole, len(points))
+        while (more := self._all_of(self.whole, excluded) & ~excluded).any():
             excluded |= more
         elastic = np.zeros(self.cells, dtype=bool)
         elastic[self.cell[~flowed[self.pieces.point]]] = True
         small = (size < SMALL) & ~elastic[self.cell]  # or renewal would spread through elastic soil
-        self.chosen = self._chosen(free & flowed & needs, excluded, small | folded[self.pieces.point])
+        self.chosen = self._chosen(free & flowed & needs, excluded, small)
         """Whether each cell (cells,) is renewed."""
         self.affected = self._at(self.chosen)
         """Whether each point (n,) loses its domain or a part of it."""
@@ -167,23 +169,39 @@ class RefilledCells:
         out[self.pieces.point[cells[self.cell]]] = True
         return out
 
-    def _all_of(self, domains: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which cells (cells,) contain a piece of the chosen domains (n,)."""
+    def _all_of(self, domains: NDArray[np.bool_], some: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the cells (cells,) of those of the `domains` (n,) that have a piece or a face in `some` cells."""
+        of = np.concatenate([self.pieces.point, self.faces.point[self.parts.row]])
+        cell = np.concatenate([self.cell, self.parts.cell])
+        reached = np.zeros(len(domains), dtype=bool)
+        reached[of[some[cell]]] = True
         out = np.zeros(self.cells, dtype=bool)
-        out[self.cell[domains[self.pieces.point]]] = True
+        out[cell[(domains & reached)[of]]] = True
         return out
 
-    def _folded(self) -> NDArray[np.bool_]:
-        """Return which domains (n,) are folded, with a face on the surface that no convex part has.
+    @property
+    def torn(self) -> NDArray[np.bool_]:
+        """Which domains (n,) would lose faces on the surface, longer than `GAP` in a cell, or have them twice.
 
-        Such a domain is renewed in all its cells or in none, because its remainders would lose the face.
+        Removed parts smaller than `CRUMB`, and remainders of folded domains, may lose faces.
         """
-        at, corners = self.faces.point, self.points.corners
-        parts, of = _convex(corners[at], self.grid.sizes_at(corners[at].mean(axis=1)).prod(axis=-1))
-        kept = np.zeros((len(at), 5), dtype=bool)
-        kept[of[:, None], parts.edge] = True  # the last column is that of edges inside a domain
-        out = np.zeros(len(corners), dtype=bool)
-        out[at[~kept[np.arange(len(at)), self.faces.face]]] = True
+        parts, new = self.parts, self.remainders[0]
+        of, cell = self.faces.point[parts.row], parts.cell
+        twice = self.chosen[cell] & ~self.affected[of]
+        length = np.linalg.norm(parts.x[:, 1] - parts.x[:, 0], axis=1)
+        length = np.where(self.affected[of] & ~self.chosen[cell], length, 0.0)
+        at, face = np.nonzero(new.parent != NONE)
+        piece = self.remainders[1][new.group[at] - int(self.chosen.sum())]
+        low, high = (new.corners[at, FACES[2][face, k]] for k in (0, 1))
+        kept = np.linalg.norm((high - low) / self.grid.sizes_of(self.cell[piece]), axis=1)
+        place, number = np.unique(
+            np.concatenate([of * self.cells + cell, self.pieces.point[piece] * self.cells + self.cell[piece]]),
+            return_inverse=True,
+        )
+        lost = sum_by(number.ravel(), np.concatenate([length, -kept]), len(place)) > GAP
+        out = np.zeros(len(self.points), dtype=bool)
+        out[of[twice]] = True
+        out[place[lost] // self.cells] = True
         return out
 
     def _excluded(self, free: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
@@ -215,7 +233,9 @@ class RefilledCells:
         more = chosen
         while more.any():
             more = np.zeros(self.cells, dtype=bool)
-            more[cell[self._at(chosen)[of] & small & ~(excluded | chosen)[cell]]] = True
+            more[cell[self._at(chosen)[of] & small]] = True
+            more |= self._all_of(self.whole, chosen)
+            more &= ~(excluded | chosen)
             chosen |= more
         return chosen
 
