@@ -355,6 +355,18 @@ def test_a_block_off_the_grid_lines_stays_at_rest_when_inertia_begins_and_falls_
         assert mass @ s.points.velocity[:, 1] / mass.sum() == pytest.approx(-9.81 * 2e-3, rel=1e-9)
 
 
+@pytest.mark.parametrize("size", [0.05, 0.7])
+def test_a_body_of_one_domain_flies_across_cells_as_larger_ones(size):
+    """Such bodies gave up, or lost velocity: the mode xy of the shape functions of a cell had no mass."""
+    grid = mpm.Grid([0, 0], [4, 4], [4, 4])
+    start, velocity = np.array([0.17, 1.5]), np.array([2.0, -0.4])
+    body = mpm.box(grid, start, start + size, per_cell=1)
+    s = mpm.Simulation(grid, [body], [BLOCK], walls={}, inertia=mpm.Moving(velocity))
+    s.run(0.7, 0.05, progress=False)
+    assert len(body) == 1 and s.points.x[0] == pytest.approx(start + size / 2 + 0.7 * velocity, abs=1e-10)
+    assert s.points.velocity[0] == pytest.approx(velocity, abs=1e-10)
+
+
 def test_a_block_falls_as_stones_do():
     grid = mpm.Grid([0, 0], [1, 4], [5, 20])
     block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import combinations
 from math import factorial, prod
 from types import MappingProxyType
 
@@ -88,13 +89,20 @@ class FormPoints:
         return PointData(self, Places(self.grid, cells, x), weight, fields)
 
     def shapes(self) -> list:
-        """Return value and gradient of each Q1 shape function at the points, as UFL."""
+        """Return value, gradient and mixed second derivatives of each Q1 shape function at the points, as UFL.
+
+        The second derivatives are one for each pair of axes.
+        """
         h, d = self.grid.edge_in_forms(), self.grid.dim
         out = []
         for signs in self.grid.signs.tolist():
-            t = [0.5 + signs[a] * self.offset[a] / h[a] for a in range(d)]
-            slopes = [signs[a] / h[a] * prod(t[b] for b in range(d) if b != a) for a in range(d)]
-            out.append((prod(t), ufl.as_vector(slopes)))
+            slope = [signs[a] / h[a] for a in range(d)]
+            t = [0.5 + slope[a] * self.offset[a] for a in range(d)]
+            first, mixed = (
+                [prod(slope[b] if b in along else t[b] for b in range(d)) for along in combinations(range(d), order)]
+                for order in (1, 2)
+            )
+            out.append((prod(t), ufl.as_vector(first), mixed))
         return out
 
     def value(self, f):

@@ -15,7 +15,10 @@ The mass is integrated over the pieces of the particle domains.  Piece k has the
 second moments S_k about x_k.  With the shape functions N and the velocity gradient L, the nodal velocities v_n follow
 from
 
-    (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T].
+    (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],
+    M = sum m_k [N N^T + grad N S_k grad N^T + sum_(a < b) d_a d_b N (S_k)_aa (S_k)_bb d_a d_b N^T].
+
+In 2D, M is exact for rectangles along the axes.  The mixed derivatives d_a d_b vanish for affine velocity fields.
 
 The ghost mass `G = c rho h^3 int [[d_n N]] [[d_n N]] dS` acts on faces of cells that are not full.  Here c is
 `GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the normal derivative.  The ghost mass has no effect on
@@ -37,7 +40,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from math import prod
 from typing import NamedTuple
 
@@ -179,8 +182,12 @@ class InertiaForms:
         for seen in [points, *of_laws] if not grid.axisymmetric else []:  # axisymmetric bodies: no spin
             seen.chord = partial(chord, midpoint=self.midpoint)
         self.pieces = p = FormPoints(grid, spread=(d, d))
-        pairs = combinations_with_replacement(p.shapes(), 2)
-        self._mass = CellSums([N * M + ufl.dot(g, p.spread * h) for (N, g), (M, h) in pairs], p)
+        both = ufl.as_vector([p.spread[a, a] * p.spread[b, b] for a, b in combinations(range(d), 2)])
+        terms = [
+            N * M + ufl.dot(g, p.spread * h) + sum(s * t * both[k] for k, (s, t) in enumerate(zip(n, m, strict=True)))
+            for (N, g, n), (M, h, m) in combinations_with_replacement(p.shapes(), 2)
+        ]
+        self._mass = CellSums(terms, p)
         self.density = fem.Function(grid.cellwise())
         """Density of the material in the cells, in kg/m^3."""
         self.work = fem.Function(V)
