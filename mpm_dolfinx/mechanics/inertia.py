@@ -35,10 +35,8 @@ for rotations (`chord`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
-from math import prod
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -48,6 +46,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_matrix
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
@@ -56,7 +55,7 @@ from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
-from mpm_dolfinx.grid.grid import corner_bits, polynomial, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import RATE, VELOCITY, MaterialPoints, middle
@@ -288,20 +287,16 @@ class Mass:
 
         `rate`, in 1/s^2: see `Inertia`.
         """
-        cut, grid, places, (off, second, _) = self._cut, self._forms.grid, self._pieces.places, self._moments
-        L = columns(velocity_gradients(points)).take(cut.pieces.point, axis=2)
-        v = points.velocity[cut.pieces.point].T + product(L, off[:, None])[:, 0]
-        sent = (cut.pieces_to_cells(np.moveaxis(values, -1, 0)) for values in (v, product(L, second)))
-        v, turn = (self._pieces.volume * np.moveaxis(of, 0, -1) for of in sent)
-        y, moments = places.offset.T, []
-        for bits in corner_bits(grid.dim):
-            axes = bits.nonzero()[0]
-            terms = (prod(y[b] for b in axes if b != a) * turn[:, a] for a in axes)
-            moments.append(places.total(sum(terms, prod(y[a] for a in axes) * v)))
-        of_cells = grid.monomials.T @ grid.over_edges(np.stack(moments, axis=1), places.filled)
-        b = self._forms.work.x.array
-        b[:] = np.bincount(places.nodal.ravel(), of_cells.ravel(), len(b))
-        rhs = self.unknowns.gather(sum_ghosts(self._forms.work), self.unknowns.vector())
+        return self._at_nodes(affine(points), rate)
+
+    def _at_nodes(self, fields: NDArray[np.float64], rate: float) -> PETSc.Vec:
+        """Return the velocities of the unknowns, projected from the result of `affine`."""
+        cut, work = self._cut, self._forms.work
+        sent = cut.pieces_to_cells(np.moveaxis(fields.take(cut.pieces.point, axis=2), -1, 0))
+        momenta, shapes = self._pieces.volume * np.moveaxis(sent, 0, -1), self._shapes[0].T
+        for axis, of in enumerate(momenta):
+            work.x.array[axis :: len(momenta)] = shapes @ of.ravel()
+        rhs = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector())
         out = self.unknowns.vector()
         rate = max(rate, self._least_rate)
         rhs.scale(rate)
@@ -343,29 +338,27 @@ class Mass:
         `parts`: index (n,) of the connected part of each point, and the number of parts.
         """
         start, end = velocities
-        seen, change = self._at_points(points, start), self._at_points(points, end - start)
-        out = {name: points.data[name] + change[name] for name in change}
+        change = self._at_points(end - start)
         if moved is not None:
-            rest = replace(points, data=points.data | {name: points.data[name] - seen[name] for name in seen})
-            projected = self._at_points(rest, self.velocity(rest, rate))
-            unseen = {name: rest.data[name] - projected[name] for name in projected}
-            after = replace(points, data=points.data | {name: seen[name] + change[name] for name in seen})
-            excess = self._excess(replace(points, data=points.data | unseen), after, *parts)
-            k = np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0)  # others keep their pieces
-            for name, values in unseen.items():
-                out[name] -= k.reshape(-1, *[1] * (values.ndim - 1)) * values
-        return out
+            seen, now = self._at_points(start), affine(points)
+            unseen = now - seen - self._at_points(self._at_nodes(now - seen, rate))
+            excess = self._excess(points, unseen, seen + change, *parts)
+            change -= np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0) * unseen
+        rates = product(change[:, 1:], columns(points.F[:, : len(change), : len(change)]))
+        return {
+            VELOCITY: points.velocity + change[:, 0].T,
+            RATE: points.data[RATE] + rates.transpose(2, 0, 1),
+        }
 
     def _excess(
-        self, unseen: MaterialPoints, seen: MaterialPoints, part: NDArray[np.int64], count: int
+        self, points: MaterialPoints, unseen: NDArray, seen: NDArray, part: NDArray[np.int64], count: int
     ) -> NDArray[np.float64]:
         """Return the fraction (n,) of the `unseen` velocities beyond their largest energy, see `carried`."""
-        grid, volume = self._forms.grid, unseen.volume0 * unseen.J
-        L, rate = (columns(velocity_gradients(of)) for of in (unseen, seen))
-        own = (unseen.velocity**2).sum(axis=1) + (product(L, self._moments[2]) * L).sum(axis=(0, 1))
-        within = ((rate**2).sum(axis=0).T * grid.sizes_at(unseen.x) ** 2).sum(axis=1) / 12
-        energies = np.array([np.bincount(part, volume * of, count) for of in (own, within)])
-        own, within = grid.comm.allreduce(energies)
+        grid, (L, rate) = self._forms.grid, (unseen[:, 1:], seen[:, 1:])
+        own = (unseen[:, 0] ** 2).sum(axis=0) + (product(L, self._second) * L).sum(axis=(0, 1))
+        within = ((rate**2).sum(axis=0).T * grid.sizes_at(points.x) ** 2).sum(axis=1) / 12
+        volume = points.volume0 * points.J
+        own, within = grid.comm.allreduce(np.array([np.bincount(part, volume * of, count) for of in (own, within)]))
         return 1 - np.sqrt(np.divide(within, own, out=np.ones(count), where=own > within))[part]
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
@@ -376,19 +369,42 @@ class Mass:
         return work.x.array.copy()
 
     @cached_property
-    def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Vectors (d, m), in m, from centroids of domains to centroids of pieces, and second moments, in m^2.
+    def _offsets(self) -> NDArray[np.float64]:
+        """Vectors (d, m), in m, from centroids of domains to centroids of pieces."""
+        x = columns(self._cut.pieces.x)
+        for _ in range(2):  # the second time removes rounding errors of large coordinates
+            x = x - self._mean(x).take(self._cut.pieces.point, axis=1)
+        return x
 
-        The moments of the pieces (d, d, m) and of the domains (d, d, n) are about their centroids.
-        """
-        pieces = self._cut.pieces
-        off, second = columns(pieces.x - self._cut.mean(pieces.x)[pieces.point]), columns(pieces.second)
-        return off, second, self._mean(off[:, None] * off + second)
+    @cached_property
+    def _second(self) -> NDArray[np.float64]:
+        """Second moments (d, d, n) of the domains about their centroids, in m^2."""
+        return self._mean(self._offsets[:, None] * self._offsets + columns(self._cut.pieces.second))
 
     @cached_property
     def _focus(self) -> NDArray[np.float64]:
         """Inverses (d, d, n), in 1/m^2, of the second moments of the domains."""
-        return inverses(self._moments[2])
+        return inverses(self._second)
+
+    @cached_property
+    def _shapes(self) -> tuple[csr_matrix, csr_matrix]:
+        """Matrices ((1 + d) m, nodes) of the shape functions N at the pieces: rows N, and moments of N in m.
+
+        The transpose of the first one gives momenta of nodes.  The second one gives mean velocities and moments of
+        pieces; it differs in 3D, where gradients are means over pieces.
+        """
+        cut, places, grid = self._cut, self._pieces.places, self._forms.grid
+        values, nodes = grid.shape_values(places.cells, places.x).T, grid.cell_nodes[places.cells]
+        sent = cut.pieces_to_cells(np.moveaxis(self._offsets, -1, 0)), cut.pieces_to_cells(cut.pieces.second)
+        off, second = map(columns, sent)
+        rows, out = (1 + grid.dim) * len(nodes), []
+        at = np.arange(0, nodes.size * (1 + grid.dim) + 1, nodes.shape[1], dtype=nodes.dtype)
+        for mixed in (None, places.mixed)[: grid.dim - 1]:
+            slopes = grid.shape_gradients(places.cells, places.x, mixed).transpose(2, 1, 0)
+            data = np.concatenate([values[None], off[:, None] * values + product(second, slopes)])
+            data = data.transpose(0, 2, 1).ravel()
+            out.append(csr_matrix((data, np.tile(nodes.ravel(), 1 + grid.dim), at), (rows, len(grid.node_x))))
+        return out[0], out[-1]
 
     @cached_property
     def _least_rate(self) -> float:
@@ -401,16 +417,19 @@ class Mass:
         pieces = self._cut.pieces
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
-    def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return affine velocity fields: in each domain, the field nearest to the field of the nodal velocities v."""
-        cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
-        d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
-        at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
-        at, slope = (columns(cut.to_pieces(values)) for values in (at, slope.reshape(-1, d, d)))
-        mean, (off, second, _) = self._mean(at), self._moments
-        moment = (at - mean.take(cut.pieces.point, axis=1))[:, None] * off + product(slope, second)
-        rate = product(product(self._mean(moment), self._focus), columns(points.F[:, :d, :d]))
-        return {VELOCITY: mean.T, RATE: rate.transpose(2, 0, 1)}
+    def _at_points(self, v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return affine fields as `affine`: in each domain, the field nearest to the field of the nodal velocities."""
+        cut, d, nodal = self._cut, self._forms.grid.dim, self.local(v)
+        of = np.array([self._shapes[1] @ nodal[axis::d] for axis in range(d)]).reshape(d, 1 + d, -1)
+        out = self._mean(np.moveaxis(cut.to_pieces(np.moveaxis(of, -1, 0)), 0, -1))
+        out[:, 1:] = product(out[:, 1:], self._focus)
+        return out
+
+
+def affine(points: MaterialPoints) -> NDArray[np.float64]:
+    """Return the velocities of the domains (d, 1 + d, n): of the points, in m/s, and velocity gradients, in 1/s."""
+    L = velocity_gradients(points).transpose(1, 2, 0)
+    return np.concatenate([columns(points.velocity)[:, None], L], axis=1)
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
