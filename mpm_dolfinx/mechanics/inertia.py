@@ -46,7 +46,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
@@ -55,7 +55,7 @@ from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import corner_bits, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import RATE, VELOCITY, MaterialPoints, middle
@@ -204,6 +204,7 @@ class InertiaForms:
     def on(
         self,
         cut: CutDomains,
+        places: Places,
         mass: NDArray[np.float64],
         fill: NDArray[np.float64],
         facets: NDArray[np.int32],
@@ -213,6 +214,7 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
+        `places`: pieces of the domains in owned cells.
         `mass` (n,), in kg: masses of the points.
         `fill` (cells,): volume fractions of the local cells.
         `facets`: faces between two active cells, at least one of them not full.
@@ -221,7 +223,6 @@ class InertiaForms:
         """
         grid = self.grid
         of_pieces = cut.shares(mass)
-        places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
         pieces = PointData(self.pieces, places, of_pieces, {"spread": cut.pieces_to_cells(cut.pieces.second)})
         content = sum_by(cut.cells, of_pieces, grid.num_local)
         volume = fill * grid.volumes(np.arange(grid.num_local))
@@ -232,16 +233,20 @@ class InertiaForms:
         of_cells = np.empty((len(places.filled), nodes, nodes))
         i, j = np.triu_indices(nodes)
         of_cells[:, i, j] = of_cells[:, j, i] = self._mass(pieces)
+        at = grid.cell_nodes[places.filled]
         for of in (unknowns, held):
-            M, P = (matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)) for _ in range(2))
-            for A in (M, P):
-                A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
-            insert_for_each_axis(M, grid.cell_nodes[places.filled], grid.dim, of_cells)
-            ghost.assemble_matrix(M)
-            penalty.penalty(P, of is held)
-            for A in (M, P):
+            near = (of.map.indices.reshape(-1, grid.dim)[at] >= 0).any(axis=(1, 2))
+            row, both = 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1), []
+            for _ in range(1 + penalty.some):
+                both.append(matrix(of, unknowns, row))
+                both[-1].setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
+            insert_for_each_axis(both[0], at[near], grid.dim, of_cells[near])
+            ghost.assemble_matrix(both[0])
+            if penalty.some:
+                penalty.penalty(both[1], of is held)
+            for A in both:
                 A.assemble()
-                matrices.append(A)
+            matrices += both if penalty.some else [*both, None]
         return Mass(self, cut, pieces, unknowns, *matrices)
 
 
@@ -251,6 +256,7 @@ class Mass:
     `pieces`: integration points of the pieces, with masses, in kg, as weights.
     `M`, `ghost`: mass matrix, in kg, and ghost penalty, in N/m, with the rows of the unknowns.
     `held`, `held_ghost`: the same matrices with the rows of displacements that walls of the grid fix.
+    `ghost` and `held_ghost` are None if no face has a penalty.
     """
 
     def __init__(
@@ -260,9 +266,9 @@ class Mass:
         pieces: PointData,
         unknowns: Unknowns,
         M: PETSc.Mat,
-        ghost: PETSc.Mat,
+        ghost: PETSc.Mat | None,
         held: PETSc.Mat,
-        held_ghost: PETSc.Mat,
+        held_ghost: PETSc.Mat | None,
     ):
         self._forms, self._cut, self._pieces, self.unknowns = forms, cut, pieces, unknowns
         self.M, self.ghost = M, ghost
@@ -276,11 +282,12 @@ class Mass:
 
     def held_forces(self, moved: PETSc.Vec, rate: float) -> PETSc.Vec:
         """Return the inertia forces, in N, at fixed nodes.  `moved`, in m: displacement minus the predictor."""
-        return self._held * moved * rate + self._held_ghost * moved
+        forces = self._held * moved * rate
+        return forces if self._held_ghost is None else forces + self._held_ghost * moved
 
     def stiffness(self, rate: float) -> PETSc.Mat:
         """Return the derivative, in N/m, of the inertia forces with respect to u.  `rate`, in 1/s^2: see `Inertia`."""
-        return self._stiffness(rate, lambda: self.M * rate + self.ghost)
+        return self._stiffness(rate, lambda: self.M * rate if self.ghost is None else self.M * rate + self.ghost)
 
     def velocity(self, points: MaterialPoints, rate: float) -> PETSc.Vec:
         """Return the velocities of the unknowns, in m/s, projected from the velocities of the points.
@@ -293,7 +300,7 @@ class Mass:
         """Return the velocities of the unknowns, projected from the result of `affine`."""
         cut, work = self._cut, self._forms.work
         sent = cut.pieces_to_cells(np.moveaxis(fields.take(cut.pieces.point, axis=2), -1, 0))
-        momenta, shapes = self._pieces.volume * np.moveaxis(sent, 0, -1), self._shapes[0].T
+        momenta, shapes = self._pieces.volume * np.moveaxis(sent, 0, -1), self._shapes[0]
         for axis, of in enumerate(momenta):
             work.x.array[axis :: len(momenta)] = shapes @ of.ravel()
         rhs = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector())
@@ -387,28 +394,38 @@ class Mass:
         return inverses(self._second)
 
     @cached_property
-    def _shapes(self) -> tuple[csr_matrix, csr_matrix]:
-        """Matrices ((1 + d) m, nodes) of the shape functions N at the pieces: rows N, and moments of N in m.
+    def _shapes(self) -> tuple[csc_matrix, csr_matrix]:
+        """Matrices of values and moments, in m, of the shape functions at the pieces.
 
-        The transpose of the first one gives momenta of nodes.  The second one gives mean velocities and moments of
-        pieces; it differs in 3D, where gradients are means over pieces.
+        The first one (nodes, (1 + d) m) gives momenta of nodes from momenta of the pieces and their moments.  The
+        second one ((1 + d) m, nodes) gives velocities of the pieces and their moments.  It is the transpose of the
+        first one, apart from gradients in 3D, which are means over pieces.
         """
         cut, places, grid = self._cut, self._pieces.places, self._forms.grid
-        values, nodes = grid.shape_values(places.cells, places.x).T, grid.cell_nodes[places.cells]
         sent = cut.pieces_to_cells(np.moveaxis(self._offsets, -1, 0)), cut.pieces_to_cells(cut.pieces.second)
         off, second = map(columns, sent)
-        rows, out = (1 + grid.dim) * len(nodes), []
-        at = np.arange(0, nodes.size * (1 + grid.dim) + 1, nodes.shape[1], dtype=nodes.dtype)
+        nodes, bits, out = grid.cell_nodes[places.cells], corner_bits(grid.dim) == 1, []
+        h = np.ones((grid.dim, 1)) if grid.even else columns(grid.sizes(places.cells))  # see `Grid.monomials`
+        y, rows = columns(places.offset) / h, (1 + grid.dim) * len(nodes)
+        terms = np.array([np.multiply.reduce(y[of]) for of in bits])
+        values, slopes = grid.monomials.T @ terms, np.empty((grid.dim, *nodes.T.shape))
+        start = np.arange(0, rows * 2**grid.dim + 1, 2**grid.dim, dtype=nodes.dtype)
         for mixed in (None, places.mixed)[: grid.dim - 1]:
-            slopes = grid.shape_gradients(places.cells, places.x, mixed).transpose(2, 1, 0)
+            for axis, has in enumerate(bits.T):
+                along = terms[~has]
+                if mixed is not None:
+                    along[-1] += mixed[:, axis] * h[axis] / np.multiply.reduce(h)
+                slopes[axis] = grid.monomials[has].T @ along / h[axis]
             data = np.concatenate([values[None], off[:, None] * values + product(second, slopes)])
-            data = data.transpose(0, 2, 1).ravel()
-            out.append(csr_matrix((data, np.tile(nodes.ravel(), 1 + grid.dim), at), (rows, len(grid.node_x))))
-        return out[0], out[-1]
+            data = data.swapaxes(1, 2).ravel()
+            out.append(csr_matrix((data, np.tile(nodes.ravel(), 1 + grid.dim), start), (rows, len(grid.node_x))))
+        return out[0].T, out[-1]
 
     @cached_property
     def _least_rate(self) -> float:
         """Smallest `rate`, in 1/s^2, for which the sum of mass and ghost penalty has half of the digits of the mass."""
+        if self.ghost is None:
+            return 0.0
         ratio = self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
         return SAME * self._forms.grid.comm.allreduce(ratio.max(initial=0.0), MPI.MAX)
 
@@ -449,6 +466,7 @@ class Inertia(Loads):
 
     def __init__(self, mass: Mass, flight: PETSc.Vec, rate: float):
         self._mass, self._flight, self.rate = mass, flight, rate
+        self._work, self._forces = flight.duplicate(), flight.duplicate()
 
     @cached_property
     def flight(self) -> NDArray[np.float64]:
@@ -461,13 +479,14 @@ class Inertia(Loads):
 
     def _moved(self, at: At) -> PETSc.Vec:
         """Return the displacements of the unknowns minus the predictor, in m."""
-        u = at.unknowns.gather(at.u, at.unknowns.vector())
+        u = at.unknowns.gather(at.u, self._work)
         u.axpy(-1.0, self._flight)
         return u
 
     def inertia(self, at: At) -> PETSc.Vec:
         """Return the inertia forces at u, in N."""
-        return self._mass.stiffness(self.rate) * self._moved(at)
+        self._mass.stiffness(self.rate).mult(self._moved(at), self._forces)
+        return self._forces
 
     @cached_property
     def rounding_at_unknowns(self) -> NDArray[np.float64]:

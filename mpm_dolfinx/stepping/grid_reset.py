@@ -536,7 +536,7 @@ class Assembled(Keyed):
         own, self.mass = self.momentum, None
         own.set_penalty(loads if stage.inertia else [own.ghost, *loads])
         if stage.inertia:
-            where = on_grid.cut, on_grid.masses, on_grid.fill, on_grid.not_full
+            where = on_grid.cut, on_grid.data.pieces.places, on_grid.masses, on_grid.fill, on_grid.not_full
             self.mass = momentum.inertia.on(*where, own.unknowns, own.held, own.ghost)
             own.mass = self.mass.M
         self.momentum.set_rounding(self._rounding(momentum, loads))
