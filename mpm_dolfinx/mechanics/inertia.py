@@ -57,6 +57,7 @@ from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointDat
 from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import corner_bits, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import RATE, VELOCITY, MaterialPoints, middle
 
@@ -117,7 +118,12 @@ def moving(
 
 def columns(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values (n, ...) as a contiguous array (..., n)."""
-    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    return np.ascontiguousarray(values.transpose(*range(1, values.ndim), 0))
+
+
+def rows(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values (..., n) as a view (n, ...)."""
+    return columns.transpose(-1, *range(columns.ndim - 1))
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -196,10 +202,10 @@ class InertiaForms:
         """Evaluate the acceleration at u."""
         np.subtract(self._u.x.array, self._flight.x.array, out=self.moved.x.array)
 
-    def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations, in m/s^2, at positions in cells.  `values`: shape functions at these positions."""
-        nodal = self.moved.x.array.reshape(-1, self.grid.dim)[self.grid.cell_nodes[cells]]
-        return self._rate.value * (values[:, :, None] * nodal).sum(axis=1)
+    def at(self, nodes: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return accelerations, in m/s^2, in cells with these nodes.  `values`: shape functions at the positions."""
+        nodal = self.moved.x.array.reshape(-1, self.grid.dim)[nodes]
+        return self._rate.value * np.add.reduce(values[:, :, None] * nodal, axis=1)
 
     def on(
         self,
@@ -299,8 +305,8 @@ class Mass:
     def _at_nodes(self, fields: NDArray[np.float64], rate: float) -> PETSc.Vec:
         """Return the velocities of the unknowns, projected from the result of `affine`."""
         cut, work = self._cut, self._forms.work
-        sent = cut.pieces_to_cells(np.moveaxis(fields.take(cut.pieces.point, axis=2), -1, 0))
-        momenta, shapes = self._pieces.volume * np.moveaxis(sent, 0, -1), self._shapes[0]
+        sent = cut.pieces_to_cells(rows(fields.take(cut.pieces.point, axis=2)))
+        momenta, shapes = columns(sent) * self._pieces.volume, self._shapes[0]
         for axis, of in enumerate(momenta):
             work.x.array[axis :: len(momenta)] = shapes @ of.ravel()
         rhs = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector())
@@ -365,7 +371,7 @@ class Mass:
         own = (unseen[:, 0] ** 2).sum(axis=0) + (product(L, self._second) * L).sum(axis=(0, 1))
         within = ((rate**2).sum(axis=0).T * grid.sizes_at(points.x) ** 2).sum(axis=1) / 12
         volume = points.volume0 * points.J
-        own, within = grid.comm.allreduce(np.array([np.bincount(part, volume * of, count) for of in (own, within)]))
+        own, within = over_all(grid.comm, sum_by(part, volume * np.array([own, within]), count))
         return 1 - np.sqrt(np.divide(within, own, out=np.ones(count), where=own > within))[part]
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
@@ -402,14 +408,14 @@ class Mass:
         first one, apart from gradients in 3D, which are means over pieces.
         """
         cut, places, grid = self._cut, self._pieces.places, self._forms.grid
-        sent = cut.pieces_to_cells(np.moveaxis(self._offsets, -1, 0)), cut.pieces_to_cells(cut.pieces.second)
+        sent = cut.pieces_to_cells(rows(self._offsets)), cut.pieces_to_cells(cut.pieces.second)
         off, second = map(columns, sent)
         nodes, bits, out = grid.cell_nodes[places.cells], corner_bits(grid.dim) == 1, []
         h = np.ones((grid.dim, 1)) if grid.even else columns(grid.sizes(places.cells))  # see `Grid.monomials`
-        y, rows = columns(places.offset) / h, (1 + grid.dim) * len(nodes)
+        y, size = columns(places.offset) / h, (1 + grid.dim) * len(nodes)
         terms = np.array([np.multiply.reduce(y[of]) for of in bits])
         values, slopes = grid.monomials.T @ terms, np.empty((grid.dim, *nodes.T.shape))
-        start = np.arange(0, rows * 2**grid.dim + 1, 2**grid.dim, dtype=nodes.dtype)
+        start = np.arange(0, size * 2**grid.dim + 1, 2**grid.dim, dtype=nodes.dtype)
         for mixed in (None, places.mixed)[: grid.dim - 1]:
             for axis, has in enumerate(bits.T):
                 along = terms[~has]
@@ -418,7 +424,7 @@ class Mass:
                 slopes[axis] = grid.monomials[has].T @ along / h[axis]
             data = np.concatenate([values[None], off[:, None] * values + product(second, slopes)])
             data = data.swapaxes(1, 2).ravel()
-            out.append(csr_matrix((data, np.tile(nodes.ravel(), 1 + grid.dim), start), (rows, len(grid.node_x))))
+            out.append(csr_matrix((data, np.tile(nodes.ravel(), 1 + grid.dim), start), (size, len(grid.node_x))))
         return out[0].T, out[-1]
 
     @cached_property
@@ -438,7 +444,7 @@ class Mass:
         """Return affine fields as `affine`: in each domain, the field nearest to the field of the nodal velocities."""
         cut, d, nodal = self._cut, self._forms.grid.dim, self.local(v)
         of = np.array([self._shapes[1] @ nodal[axis::d] for axis in range(d)]).reshape(d, 1 + d, -1)
-        out = self._mean(np.moveaxis(cut.to_pieces(np.moveaxis(of, -1, 0)), 0, -1))
+        out = self._mean(columns(cut.to_pieces(rows(of))))
         out[:, 1:] = product(out[:, 1:], self._focus)
         return out
 

@@ -234,4 +234,4 @@ def balances(
 def pushed_back(scene: Scene, on_grid: OnGrid, cells: NDArray[np.int64] | slice) -> NDArray[np.float64]:
     """Return the inertia forces (n, d) on the pore fluid in the chosen filled owned cells, in N/m^3."""
     contents = on_grid.contents
-    return -scene.fluid.density * scene.momentum.inertia.at(contents.filled[cells], contents.shape_values[cells])
+    return -scene.fluid.density * scene.momentum.inertia.at(contents.nodes[cells], contents.shape_values[cells])

@@ -125,11 +125,16 @@ class OnGrid(Keyed):
         Let 2 x 2 cells of Q1 elements have a consistent mass. A displacement of the middle node over the time t has a
         resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.  `seconds`: t, in s.
         """
+        return self._resisting_mass / seconds**2
+
+    @cached_property
+    def _resisting_mass(self) -> NDArray[np.float64]:
+        """Result of `resisting_mass` for t = 1 s."""
         filled, cut = self.contents.filled, self.cut
         density = cut.to_cells(self._materials.present_density(cut.points))
         modulus = self._rows(lambda m: m.macroelement)
         density, modulus = map(self.contents.mean, (density, modulus))
-        return density * (cut.grid.sizes(filled).min(axis=-1) / seconds) ** 2 / (3 * modulus)
+        return density * cut.grid.sizes(filled).min(axis=-1) ** 2 / (3 * modulus)
 
     @property
     def mixes(self) -> bool:
