@@ -57,7 +57,6 @@ from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointDat
 from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import corner_bits, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import RATE, VELOCITY, MaterialPoints, middle
 
@@ -119,11 +118,6 @@ def moving(
 def columns(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values (n, ...) as a contiguous array (..., n)."""
     return np.ascontiguousarray(values.transpose(*range(1, values.ndim), 0))
-
-
-def rows(columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values (..., n) as a view (n, ...)."""
-    return columns.transpose(-1, *range(columns.ndim - 1))
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -239,20 +233,18 @@ class InertiaForms:
         of_cells = np.empty((len(places.filled), nodes, nodes))
         i, j = np.triu_indices(nodes)
         of_cells[:, i, j] = of_cells[:, j, i] = self._mass(pieces)
-        at = grid.cell_nodes[places.filled]
+        at, count = grid.cell_nodes[places.filled], 1 + penalty.some
         for of in (unknowns, held):
             near = (of.map.indices.reshape(-1, grid.dim)[at] >= 0).any(axis=(1, 2))
-            row, both = 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1), []
-            for _ in range(1 + penalty.some):
-                both.append(matrix(of, unknowns, row))
-                both[-1].setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
+            both = [matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)) for _ in range(count)]
+            for A in both:
+                A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
             insert_for_each_axis(both[0], at[near], grid.dim, of_cells[near])
             ghost.assemble_matrix(both[0])
-            if penalty.some:
-                penalty.penalty(both[1], of is held)
+            penalty.penalty(both[-1], of is held)
             for A in both:
                 A.assemble()
-            matrices += both if penalty.some else [*both, None]
+            matrices += [*both, None][:2]
         return Mass(self, cut, pieces, unknowns, *matrices)
 
 
@@ -295,20 +287,15 @@ class Mass:
         """Return the derivative, in N/m, of the inertia forces with respect to u.  `rate`, in 1/s^2: see `Inertia`."""
         return self._stiffness(rate, lambda: self.M * rate if self.ghost is None else self.M * rate + self.ghost)
 
-    def velocity(self, points: MaterialPoints, rate: float) -> PETSc.Vec:
+    def velocity(self, fields: NDArray[np.float64], rate: float) -> PETSc.Vec:
         """Return the velocities of the unknowns, in m/s, projected from the velocities of the points.
 
-        `rate`, in 1/s^2: see `Inertia`.
+        `fields`: result of `affine`.  `rate`, in 1/s^2: see `Inertia`.
         """
-        return self._at_nodes(affine(points), rate)
-
-    def _at_nodes(self, fields: NDArray[np.float64], rate: float) -> PETSc.Vec:
-        """Return the velocities of the unknowns, projected from the result of `affine`."""
         cut, work = self._cut, self._forms.work
-        sent = cut.pieces_to_cells(rows(fields.take(cut.pieces.point, axis=2)))
-        momenta, shapes = columns(sent) * self._pieces.volume, self._shapes[0]
-        for axis, of in enumerate(momenta):
-            work.x.array[axis :: len(momenta)] = shapes @ of.ravel()
+        sent = cut.pieces_to_cells(fields.take(cut.pieces.point, axis=2).transpose(2, 0, 1))
+        for axis, momenta in enumerate(columns(sent) * self._pieces.volume):
+            work.x.array[axis :: len(fields)] = self._shapes[0] @ momenta.ravel()
         rhs = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector())
         out = self.unknowns.vector()
         rate = max(rate, self._least_rate)
@@ -354,14 +341,11 @@ class Mass:
         change = self._at_points(end - start)
         if moved is not None:
             seen, now = self._at_points(start), affine(points)
-            unseen = now - seen - self._at_points(self._at_nodes(now - seen, rate))
+            unseen = now - seen - self._at_points(self.velocity(now - seen, rate))
             excess = self._excess(points, unseen, seen + change, *parts)
             change -= np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0) * unseen
         rates = product(change[:, 1:], columns(points.F[:, : len(change), : len(change)]))
-        return {
-            VELOCITY: points.velocity + change[:, 0].T,
-            RATE: points.data[RATE] + rates.transpose(2, 0, 1),
-        }
+        return {VELOCITY: points.velocity + change[:, 0].T, RATE: points.data[RATE] + rates.transpose(2, 0, 1)}
 
     def _excess(
         self, points: MaterialPoints, unseen: NDArray, seen: NDArray, part: NDArray[np.int64], count: int
@@ -371,7 +355,9 @@ class Mass:
         own = (unseen[:, 0] ** 2).sum(axis=0) + (product(L, self._second) * L).sum(axis=(0, 1))
         within = ((rate**2).sum(axis=0).T * grid.sizes_at(points.x) ** 2).sum(axis=1) / 12
         volume = points.volume0 * points.J
-        own, within = over_all(grid.comm, sum_by(part, volume * np.array([own, within]), count))
+        energies = sum_by(part, volume * np.array([own, within]), count)
+        grid.comm.Allreduce(MPI.IN_PLACE, energies)
+        own, within = energies
         return 1 - np.sqrt(np.divide(within, own, out=np.ones(count), where=own > within))[part]
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
@@ -384,10 +370,9 @@ class Mass:
     @cached_property
     def _offsets(self) -> NDArray[np.float64]:
         """Vectors (d, m), in m, from centroids of domains to centroids of pieces."""
-        x = columns(self._cut.pieces.x)
-        for _ in range(2):  # the second time removes rounding errors of large coordinates
-            x = x - self._mean(x).take(self._cut.pieces.point, axis=1)
-        return x
+        point = self._cut.pieces.point
+        off = columns(self._cut.pieces.x - self._cut.points.x[point])
+        return off - self._mean(off).take(point, axis=1)
 
     @cached_property
     def _second(self) -> NDArray[np.float64]:
@@ -407,24 +392,17 @@ class Mass:
         second one ((1 + d) m, nodes) gives velocities of the pieces and their moments.  It is the transpose of the
         first one, apart from gradients in 3D, which are means over pieces.
         """
-        cut, places, grid = self._cut, self._pieces.places, self._forms.grid
-        sent = cut.pieces_to_cells(rows(self._offsets)), cut.pieces_to_cells(cut.pieces.second)
-        off, second = map(columns, sent)
-        nodes, bits, out = grid.cell_nodes[places.cells], corner_bits(grid.dim) == 1, []
-        h = np.ones((grid.dim, 1)) if grid.even else columns(grid.sizes(places.cells))  # see `Grid.monomials`
-        y, size = columns(places.offset) / h, (1 + grid.dim) * len(nodes)
-        terms = np.array([np.multiply.reduce(y[of]) for of in bits])
-        values, slopes = grid.monomials.T @ terms, np.empty((grid.dim, *nodes.T.shape))
-        start = np.arange(0, size * 2**grid.dim + 1, 2**grid.dim, dtype=nodes.dtype)
-        for mixed in (None, places.mixed)[: grid.dim - 1]:
-            for axis, has in enumerate(bits.T):
-                along = terms[~has]
-                if mixed is not None:
-                    along[-1] += mixed[:, axis] * h[axis] / np.multiply.reduce(h)
-                slopes[axis] = grid.monomials[has].T @ along / h[axis]
-            data = np.concatenate([values[None], off[:, None] * values + product(second, slopes)])
-            data = data.swapaxes(1, 2).ravel()
-            out.append(csr_matrix((data, np.tile(nodes.ravel(), 1 + grid.dim), start), (size, len(grid.node_x))))
+        cut, places, d = self._cut, self._pieces.places, self._forms.grid.dim
+        off, second = (columns(cut.pieces_to_cells(of)) for of in (self._offsets.T, cut.pieces.second))
+        nodes, grid, out = places.grid.cell_nodes[places.cells], places.grid, []
+        of = grid.over_edges(grid.monomials.T[:, :, None], places.cells)
+        values = sum(of[:, k] * np.multiply.reduce(places.offset.T[bits == 1]) for k, bits in enumerate(corner_bits(d)))
+        start = np.arange(0, (1 + d) * nodes.size + 1, nodes.shape[1], dtype=nodes.dtype)
+        for at in (places,) if d == 2 else (Places(grid, places.cells, places.x), places):
+            slopes = np.array([sum(of[:, k | 1 << a] * terms for k, terms in at.products[a]) for a in range(d)])
+            data = np.concatenate([values[None], off[:, None] * values + product(second, slopes)]).swapaxes(1, 2)
+            parts = data.ravel(), np.tile(nodes.ravel(), 1 + d), start
+            out.append(csr_matrix(parts, (len(start) - 1, len(grid.node_x))))
         return out[0].T, out[-1]
 
     @cached_property
@@ -444,7 +422,7 @@ class Mass:
         """Return affine fields as `affine`: in each domain, the field nearest to the field of the nodal velocities."""
         cut, d, nodal = self._cut, self._forms.grid.dim, self.local(v)
         of = np.array([self._shapes[1] @ nodal[axis::d] for axis in range(d)]).reshape(d, 1 + d, -1)
-        out = self._mean(columns(cut.to_pieces(rows(of))))
+        out = self._mean(columns(cut.to_pieces(of.transpose(2, 0, 1))))
         out[:, 1:] = product(out[:, 1:], self._focus)
         return out
 

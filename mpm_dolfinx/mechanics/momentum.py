@@ -45,7 +45,6 @@ from mpm_dolfinx.mechanics.mean_dilatation import FBar, MeanDilatation, SumsOfPa
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.active import Active, ActiveSet
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
 
@@ -579,7 +578,7 @@ class MomentumProblem:
             dofs, values = [*dofs, at_walls], [*values, -counted]
         grid, dofs = self.forms.grid, np.concatenate(dofs)
         shares = self.forms.wall_shares((walls, dofs), partial(wall_shares, grid, walls, dofs))
-        out = over_all(grid.comm, sum_by(dofs % grid.dim, shares * np.concatenate(values), grid.dim))
+        out = grid.comm.allreduce(sum_by(dofs % grid.dim, shares * np.concatenate(values), grid.dim))
         if grid.has_axis:
             out[0, 0] = 0.0
         return dict(zip(SIDES[grid.dim], out, strict=True))

@@ -75,8 +75,8 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     momentum.assemble_residual()
     unknowns = momentum.system.unknowns
     K = momentum.assemble_tangent()
-    if state.stage.inertia and start.matrices.mass.ghost is not None:
-        K = K + start.matrices.mass.ghost
+    if state.stage.inertia:
+        K = K + start.matrices.mass.stiffness(0.0)
     blocks = {"stiffness": _csr(K), "x": unknowns.positions}
     blocks |= dict(zip(("nodes", "components"), unknowns.nodes, strict=True))
     if storage is not None:

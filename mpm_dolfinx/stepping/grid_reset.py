@@ -119,17 +119,13 @@ class OnGrid(Keyed):
                     law = cut.to_cells(quadrature.materials.retention_of(cut.points))
                     self._borders = Borders(self.contents, cut.cells, alike, law, self.facets, self._mixed)
 
-    def resisting_mass(self, seconds: float) -> NDArray[np.float64]:
-        """Return the ratio of inertial to elastic resistance (n,) in the filled owned cells.
+    @cached_property
+    def resisting_mass(self) -> NDArray[np.float64]:
+        """Ratio of inertial to elastic resistance (n,) in the filled owned cells, for a motion in t = 1 s.
 
         Let 2 x 2 cells of Q1 elements have a consistent mass. A displacement of the middle node over the time t has a
-        resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.  `seconds`: t, in s.
+        resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.
         """
-        return self._resisting_mass / seconds**2
-
-    @cached_property
-    def _resisting_mass(self) -> NDArray[np.float64]:
-        """Result of `resisting_mass` for t = 1 s."""
         filled, cut = self.contents.filled, self.cut
         density = cut.to_cells(self._materials.present_density(cut.points))
         modulus = self._rows(lambda m: m.macroelement)
