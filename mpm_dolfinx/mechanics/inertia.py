@@ -54,7 +54,7 @@ from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
-from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
+from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import corner_bits, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
@@ -233,18 +233,19 @@ class InertiaForms:
         of_cells = np.empty((len(places.filled), nodes, nodes))
         i, j = np.triu_indices(nodes)
         of_cells[:, i, j] = of_cells[:, j, i] = self._mass(pieces)
-        at, count = grid.cell_nodes[places.filled], 1 + penalty.some
+        at, length = grid.cell_nodes[places.filled], 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)
         for of in (unknowns, held):
             near = (of.map.indices.reshape(-1, grid.dim)[at] >= 0).any(axis=(1, 2))
-            both = [matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)) for _ in range(count)]
+            both = [matrix(of, unknowns, length) for _ in range(1 + penalty.some)]
             for A in both:
                 A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
-            insert_for_each_axis(both[0], at[near], grid.dim, of_cells[near])
+            for dofs in (at[near] * grid.dim + axis for axis in range(grid.dim * near.any())):
+                both[0].setValuesLocalRCV(*[dofs.astype(PETSc.IntType)] * 2, of_cells[near], addv=True)
             ghost.assemble_matrix(both[0])
             penalty.penalty(both[-1], of is held)
             for A in both:
                 A.assemble()
-            matrices += [*both, None][:2]
+            matrices.append((both[0], both[1] if penalty.some else None))
         return Mass(self, cut, pieces, unknowns, *matrices)
 
 
@@ -252,36 +253,23 @@ class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
     `pieces`: integration points of the pieces, with masses, in kg, as weights.
-    `M`, `ghost`: mass matrix, in kg, and ghost penalty, in N/m, with the rows of the unknowns.
-    `held`, `held_ghost`: the same matrices with the rows of displacements that walls of the grid fix.
-    `ghost` and `held_ghost` are None if no face has a penalty.
+    `matrices`: mass matrix `M`, in kg, and ghost penalty `ghost`, in N/m, with the rows of the unknowns.  Without faces
+    that have a penalty, `ghost` is None.
+    `held`: the same matrices with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
-        self,
-        forms: InertiaForms,
-        cut: CutDomains,
-        pieces: PointData,
-        unknowns: Unknowns,
-        M: PETSc.Mat,
-        ghost: PETSc.Mat | None,
-        held: PETSc.Mat,
-        held_ghost: PETSc.Mat | None,
+        self, forms: InertiaForms, cut: CutDomains, pieces: PointData, unknowns: Unknowns, matrices: tuple, held: tuple
     ):
         self._forms, self._cut, self._pieces, self.unknowns = forms, cut, pieces, unknowns
-        self.M, self.ghost = M, ghost
-        self._held, self._held_ghost = held, held_ghost
+        self.M, self.ghost = matrices
+        self.held = held
         self._stiffness = Latest()
         self._solver = ksp = PETSc.KSP().create(unknowns.comm)
         ksp.setType(PETSc.KSP.Type.CG)
         kinds = PETSc.PC.Type  # the same preconditioner; the faster one is for one process
         ksp.getPC().setType(kinds.EISENSTAT if ksp.comm.size == 1 else kinds.SOR)
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0, divtol=np.inf)
-
-    def held_forces(self, moved: PETSc.Vec, rate: float) -> PETSc.Vec:
-        """Return the inertia forces, in N, at fixed nodes.  `moved`, in m: displacement minus the predictor."""
-        forces = self._held * moved * rate
-        return forces if self._held_ghost is None else forces + self._held_ghost * moved
 
     def stiffness(self, rate: float) -> PETSc.Mat:
         """Return the derivative, in N/m, of the inertia forces with respect to u.  `rate`, in 1/s^2: see `Inertia`."""
@@ -352,10 +340,9 @@ class Mass:
     ) -> NDArray[np.float64]:
         """Return the fraction (n,) of the `unseen` velocities beyond their largest energy, see `carried`."""
         grid, (L, rate) = self._forms.grid, (unseen[:, 1:], seen[:, 1:])
-        own = (unseen[:, 0] ** 2).sum(axis=0) + (product(L, self._second) * L).sum(axis=(0, 1))
+        own = (unseen[:, 0] ** 2).sum(axis=0) + (product(L, self._second[0]) * L).sum(axis=(0, 1))
         within = ((rate**2).sum(axis=0).T * grid.sizes_at(points.x) ** 2).sum(axis=1) / 12
-        volume = points.volume0 * points.J
-        energies = sum_by(part, volume * np.array([own, within]), count)
+        energies = sum_by(part, points.volume0 * points.J * [own, within], count)
         grid.comm.Allreduce(MPI.IN_PLACE, energies)
         own, within = energies
         return 1 - np.sqrt(np.divide(within, own, out=np.ones(count), where=own > within))[part]
@@ -375,26 +362,21 @@ class Mass:
         return off - self._mean(off).take(point, axis=1)
 
     @cached_property
-    def _second(self) -> NDArray[np.float64]:
-        """Second moments (d, d, n) of the domains about their centroids, in m^2."""
-        return self._mean(self._offsets[:, None] * self._offsets + columns(self._cut.pieces.second))
-
-    @cached_property
-    def _focus(self) -> NDArray[np.float64]:
-        """Inverses (d, d, n), in 1/m^2, of the second moments of the domains."""
-        return inverses(self._second)
+    def _second(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Second moments (d, d, n) of the domains about their centroids, in m^2, and inverses of these matrices."""
+        second = self._mean(self._offsets[:, None] * self._offsets + columns(self._cut.pieces.second))
+        return second, inverses(second)
 
     @cached_property
     def _shapes(self) -> tuple[csc_matrix, csr_matrix]:
-        """Matrices of values and moments, in m, of the shape functions at the pieces.
+        """Matrix (nodes, (1 + d) m) from momenta of the m pieces to nodes, and from nodes to velocities of the pieces.
 
-        The first one (nodes, (1 + d) m) gives momenta of nodes from momenta of the pieces and their moments.  The
-        second one ((1 + d) m, nodes) gives velocities of the pieces and their moments.  It is the transpose of the
-        first one, apart from gradients in 3D, which are means over pieces.
+        The second matrix is the transpose, but in 3D its gradients are means over pieces.
         """
-        cut, places, d = self._cut, self._pieces.places, self._forms.grid.dim
+        cut, places = self._cut, self._pieces.places
         off, second = (columns(cut.pieces_to_cells(of)) for of in (self._offsets.T, cut.pieces.second))
-        nodes, grid, out = places.grid.cell_nodes[places.cells], places.grid, []
+        grid, d, out = places.grid, places.grid.dim, []
+        nodes = grid.cell_nodes[places.cells]
         of = grid.over_edges(grid.monomials.T[:, :, None], places.cells)
         values = sum(of[:, k] * np.multiply.reduce(places.offset.T[bits == 1]) for k, bits in enumerate(corner_bits(d)))
         start = np.arange(0, (1 + d) * nodes.size + 1, nodes.shape[1], dtype=nodes.dtype)
@@ -408,9 +390,7 @@ class Mass:
     @cached_property
     def _least_rate(self) -> float:
         """Smallest `rate`, in 1/s^2, for which the sum of mass and ghost penalty has half of the digits of the mass."""
-        if self.ghost is None:
-            return 0.0
-        ratio = self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
+        ratio = np.zeros(1) if self.ghost is None else self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
         return SAME * self._forms.grid.comm.allreduce(ratio.max(initial=0.0), MPI.MAX)
 
     def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -423,14 +403,13 @@ class Mass:
         cut, d, nodal = self._cut, self._forms.grid.dim, self.local(v)
         of = np.array([self._shapes[1] @ nodal[axis::d] for axis in range(d)]).reshape(d, 1 + d, -1)
         out = self._mean(columns(cut.to_pieces(of.transpose(2, 0, 1))))
-        out[:, 1:] = product(out[:, 1:], self._focus)
+        out[:, 1:] = product(out[:, 1:], self._second[1])
         return out
 
 
 def affine(points: MaterialPoints) -> NDArray[np.float64]:
     """Return the velocities of the domains (d, 1 + d, n): of the points, in m/s, and velocity gradients, in 1/s."""
-    L = velocity_gradients(points).transpose(1, 2, 0)
-    return np.concatenate([columns(points.velocity)[:, None], L], axis=1)
+    return np.concatenate([columns(points.velocity)[:, None], velocity_gradients(points).transpose(1, 2, 0)], axis=1)
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
@@ -482,7 +461,8 @@ class Inertia(Loads):
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the inertia forces to the residual at fixed nodes."""
         if on is not self._mass.unknowns:
-            residual += self._mass.held_forces(self._moved(at), self.rate)
+            (M, ghost), moved = self._mass.held, self._moved(at)
+            residual += M * moved * self.rate if ghost is None else M * moved * self.rate + ghost * moved
 
     def coupling(self, at: At) -> PETSc.Mat:
         """See `Loads`."""

@@ -450,8 +450,7 @@ class Newton:
             if errors.fluid is None:
                 return self._solvers.solve(self._kept, rtol, forces)
             least = errors.fluid.round_off / self._scheme.tolerance
-            measures = forces, np.maximum(errors.exchanged, least)
-            goal = SOLVED * self._scheme.tolerance
+            measures, goal = (forces, np.maximum(errors.exchanged, least)), SOLVED * self._scheme.tolerance
             if not slow or self._linear or self._storage.forms.retains:
                 return self._solvers.solve(self._kept, rtol, *measures, goal=goal)
             forms = self._momentum.forms

@@ -229,8 +229,7 @@ class LinearSolvers:
         `rtol`: relative tolerance, for each connected part.
         `forces`, `exchanged` (parts,): scales of the residuals: forces (N) and exchanged fluid volume (m^d).
         `slope`: derivative of the fluxes with respect to displacements, if the tangent includes it.
-        `goal`: relative residual of the storage, to which scenes with inertia solve more accurately than to `rtol`.  If
-        the displacements are far from balance, the condensed residual exceeds the residual of the storage.
+        `goal`: with inertia, relative residual of the storage after the solve.  The condensed residual may be larger.
         """
         slopes = () if slope is None else (slope,)
         if self._storage is None:
