@@ -284,8 +284,7 @@ class Mass:
         sent = cut.pieces_to_cells(fields.take(cut.pieces.point, axis=2).transpose(2, 0, 1))
         for axis, momenta in enumerate(columns(sent) * self._pieces.volume):
             work.x.array[axis :: len(fields)] = self._shapes[0] @ momenta.ravel()
-        rhs = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector())
-        out = self.unknowns.vector()
+        rhs, out = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector()), self.unknowns.vector()
         rate = max(rate, self._least_rate)
         rhs.scale(rate)
         self._solver.setOperators(self.stiffness(rate))
@@ -325,10 +324,9 @@ class Mass:
         all points keep them.
         `parts`: index (n,) of the connected part of each point, and the number of parts.
         """
-        start, end = velocities
-        change = self._at_points(end - start)
+        change = self._at_points(velocities[1] - velocities[0])
         if moved is not None:
-            seen, now = self._at_points(start), affine(points)
+            seen, now = self._at_points(velocities[0]), affine(points)
             unseen = now - seen - self._at_points(self.velocity(now - seen, rate))
             excess = self._excess(points, unseen, seen + change, *parts)
             change -= np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0) * unseen
@@ -390,7 +388,9 @@ class Mass:
     @cached_property
     def _least_rate(self) -> float:
         """Smallest `rate`, in 1/s^2, for which the sum of mass and ghost penalty has half of the digits of the mass."""
-        ratio = np.zeros(1) if self.ghost is None else self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
+        if self.ghost is None:
+            return 0.0
+        ratio = self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
         return SAME * self._forms.grid.comm.allreduce(ratio.max(initial=0.0), MPI.MAX)
 
     def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
