@@ -377,12 +377,12 @@ class Mass:
         nodes = grid.cell_nodes[places.cells]
         of = grid.over_edges(grid.monomials.T[:, :, None], places.cells)
         values = sum(of[:, k] * np.multiply.reduce(places.offset.T[bits == 1]) for k, bits in enumerate(corner_bits(d)))
-        start = np.arange(0, (1 + d) * nodes.size + 1, nodes.shape[1], dtype=nodes.dtype)
-        index = np.tile(nodes.ravel(), 1 + d), start  # the matrices share it
+        index = np.tile(nodes.ravel(), 1 + d), np.arange(0, (1 + d) * nodes.size + 1, 2**d, dtype=nodes.dtype)
         for at in (places,) if d == 2 else (Places(grid, places.cells, places.x), places):
             slopes = np.array([sum(of[:, k | 1 << a] * terms for k, terms in at.products[a]) for a in range(d)])
-            data = np.concatenate([values[None], off[:, None] * values + product(second, slopes)]).swapaxes(1, 2)
-            out.append(csr_matrix((data.ravel(), *index), (len(start) - 1, len(grid.node_x))))
+            moments = (x * values + sum(map(np.multiply, S, slopes)) for x, S in zip(off, second, strict=True))
+            data = np.array([rows.T for rows in (values, *moments)]).ravel()
+            out.append(csr_matrix((data, *index), (len(index[1]) - 1, len(grid.node_x))))
         return out[0].T, out[-1]
 
     @cached_property
