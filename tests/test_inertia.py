@@ -516,6 +516,17 @@ def test_newton_takes_two_steps_for_a_sudden_load_on_permeable_pores(steps):
         assert s.step(0.1 / steps).newton <= 4
 
 
+def test_newton_takes_one_step_in_each_substep_of_a_column_that_drains_under_a_growing_load():
+    """Newton's method took two: the linear solve was as accurate as the smaller residual before the condensation."""
+    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
+    grid = mpm.Grid([0, 0], [1, 1.5], [8, 12])
+    conditions = [mpm.Traction("top", lambda t: (0, -20 * t)), mpm.Drained("top")]
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    column, options = mpm.box(grid, [0, 0], [1, 1]), {"conditions": conditions, "fluid": mpm.Fluid()}
+    s = mpm.Simulation(grid, [column], [soil], walls=walls, inertia=True, **options)
+    assert [s.step(0.1).newton for _ in range(3)] == [2, 2, 2]
+
+
 @pytest.mark.parametrize("bulk", [1e7, 2.2e9])
 def test_undrained_waves_are_as_exact_as_dry_ones(bulk):
     """A quarter of a wave in 10 cells: the damping of pressure jumps made it too slow, by 7 % for hard water."""

@@ -151,7 +151,7 @@ class OpenFaces:
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow (m,) through each face due to inertia forces on the fluid, in m^d/s."""
-        return np.einsum("md,md->m", fluid.force(self.at), self.by_force(fluid))
+        return np.add.reduce(fluid.force(self.at) * self.by_force(fluid), axis=1)
 
     def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative (m, d) of the outflow `driven` with respect to the inertia force, in m^(d+3)/(N s)."""

@@ -326,13 +326,9 @@ class PointData(Keyed):
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (n, 9) for the nodal values u of a Q1 vector."""
         out = np.zeros((len(self.cells), 3, 3))
-        out[:, :2, :2] = np.eye(2) + self.gradients_of(u).reshape(-1, 2, 2)
+        out[:, :2, :2] = np.eye(2) + self._of_nodal(u.take(self.places.nodal)).reshape(-1, 2, 2)
         out[:, 2, 2] = self.places.stretch(u.reshape(-1, 2))
         return out.reshape(len(out), 9)
-
-    def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector with the nodal values u."""
-        return self._of_nodal(u.take(self.places.nodal))
 
     def _of_nodal(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients of a Q1 vector from its values at the nodes of cells."""

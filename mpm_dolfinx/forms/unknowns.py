@@ -119,13 +119,6 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
     return A
 
 
-def insert_for_each_axis(A: PETSc.Mat, nodes: NDArray[np.int32], dim: int, matrices: NDArray[np.float64]) -> None:
-    """Add scalar element matrices (cells, n, n) to `A` for each of `dim` components at the nodes (cells, n)."""
-    for axis in range(dim if len(nodes) else 0):
-        dofs = (nodes * dim + axis).astype(PETSc.IntType)
-        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
-
-
 def zero(A: PETSc.Mat) -> None:
     """Set a matrix to zero before assembly.  A matrix that has never been assembled does not change."""
     if A.assembled:

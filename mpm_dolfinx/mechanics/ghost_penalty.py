@@ -146,6 +146,8 @@ class GhostLoads(Loads):
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls
+        self.some = everywhere.some
+        """Whether any process has faces with a penalty."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of the penalty."""

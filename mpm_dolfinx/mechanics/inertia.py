@@ -38,10 +38,8 @@ for rotations (`chord`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from itertools import combinations, combinations_with_replacement
-from math import prod
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -51,6 +49,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csc_matrix, csr_matrix
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
@@ -58,8 +57,8 @@ from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
-from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
-from mpm_dolfinx.grid.grid import corner_bits, polynomial, sum_by
+from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
+from mpm_dolfinx.grid.grid import corner_bits, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import RATE, VELOCITY, MaterialPoints, middle
@@ -121,7 +120,7 @@ def moving(
 
 def columns(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values (n, ...) as a contiguous array (..., n)."""
-    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    return np.ascontiguousarray(values.transpose(*range(1, values.ndim), 0))
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -204,14 +203,15 @@ class InertiaForms:
         """Evaluate the acceleration at u."""
         np.subtract(self._u.x.array, self._flight.x.array, out=self.moved.x.array)
 
-    def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations, in m/s^2, at positions in cells.  `values`: shape functions at these positions."""
-        nodal = self.moved.x.array.reshape(-1, self.grid.dim)[self.grid.cell_nodes[cells]]
-        return self._rate.value * (values[:, :, None] * nodal).sum(axis=1)
+    def at(self, nodes: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return accelerations, in m/s^2, in cells with these nodes.  `values`: shape functions at the positions."""
+        nodal = self.moved.x.array.reshape(-1, self.grid.dim)[nodes]
+        return self._rate.value * np.add.reduce(values[:, :, None] * nodal, axis=1)
 
     def on(
         self,
         cut: CutDomains,
+        places: Places,
         mass: NDArray[np.float64],
         fill: NDArray[np.float64],
         facets: NDArray[np.int32],
@@ -221,6 +221,7 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
+        `places`: pieces of the domains in owned cells.
         `mass` (n,), in kg: masses of the points.
         `fill` (cells,): volume fractions of the local cells.
         `facets`: faces between two active cells, at least one of them not full.
@@ -229,7 +230,6 @@ class InertiaForms:
         """
         grid = self.grid
         of_pieces = cut.shares(mass)
-        places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
         pieces = PointData(self.pieces, places, of_pieces, {"spread": cut.pieces_to_cells(cut.pieces.second)})
         content = sum_by(cut.cells, of_pieces, grid.num_local)
         volume = fill * grid.volumes(np.arange(grid.num_local))
@@ -240,16 +240,19 @@ class InertiaForms:
         of_cells = np.empty((len(places.filled), nodes, nodes))
         i, j = np.triu_indices(nodes)
         of_cells[:, i, j] = of_cells[:, j, i] = self._mass(pieces)
+        at, length = grid.cell_nodes[places.filled], 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)
         for of in (unknowns, held):
-            M, P = (matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1)) for _ in range(2))
-            for A in (M, P):
+            near = (of.map.indices.reshape(-1, grid.dim)[at] >= 0).any(axis=(1, 2))
+            both = [matrix(of, unknowns, length) for _ in range(1 + penalty.some)]
+            for A in both:
                 A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the matrices do not couple the axes
-            insert_for_each_axis(M, grid.cell_nodes[places.filled], grid.dim, of_cells)
-            ghost.assemble_matrix(M)
-            penalty.penalty(P, of is held)
-            for A in (M, P):
+            for dofs in (at[near] * grid.dim + axis for axis in range(grid.dim * near.any())):
+                both[0].setValuesLocalRCV(*[dofs.astype(PETSc.IntType)] * 2, of_cells[near], addv=True)
+            ghost.assemble_matrix(both[0])
+            penalty.penalty(both[-1], of is held)
+            for A in both:
                 A.assemble()
-                matrices.append(A)
+            matrices.append((both[0], both[1] if penalty.some else None))
         return Mass(self, cut, pieces, unknowns, *matrices)
 
 
@@ -257,24 +260,17 @@ class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
     `pieces`: integration points of the pieces, with masses, in kg, as weights.
-    `M`, `ghost`: mass matrix, in kg, and ghost penalty, in N/m, with the rows of the unknowns.
-    `held`, `held_ghost`: the same matrices with the rows of displacements that walls of the grid fix.
+    `matrices`: mass matrix `M`, in kg, and ghost penalty `ghost`, in N/m, with the rows of the unknowns.  Without faces
+    that have a penalty, `ghost` is None.
+    `held`: the same matrices with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
-        self,
-        forms: InertiaForms,
-        cut: CutDomains,
-        pieces: PointData,
-        unknowns: Unknowns,
-        M: PETSc.Mat,
-        ghost: PETSc.Mat,
-        held: PETSc.Mat,
-        held_ghost: PETSc.Mat,
+        self, forms: InertiaForms, cut: CutDomains, pieces: PointData, unknowns: Unknowns, matrices: tuple, held: tuple
     ):
         self._forms, self._cut, self._pieces, self.unknowns = forms, cut, pieces, unknowns
-        self.M, self.ghost = M, ghost
-        self._held, self._held_ghost = held, held_ghost
+        self.M, self.ghost = matrices
+        self.held = held
         self._stiffness = Latest()
         self._solver = ksp = PETSc.KSP().create(unknowns.comm)
         ksp.setType(PETSc.KSP.Type.CG)
@@ -282,34 +278,20 @@ class Mass:
         ksp.getPC().setType(kinds.EISENSTAT if ksp.comm.size == 1 else kinds.SOR)
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0, divtol=np.inf)
 
-    def held_forces(self, moved: PETSc.Vec, rate: float) -> PETSc.Vec:
-        """Return the inertia forces, in N, at fixed nodes.  `moved`, in m: displacement minus the predictor."""
-        return self._held * moved * rate + self._held_ghost * moved
-
     def stiffness(self, rate: float) -> PETSc.Mat:
         """Return the derivative, in N/m, of the inertia forces with respect to u.  `rate`, in 1/s^2: see `Inertia`."""
-        return self._stiffness(rate, lambda: self.M * rate + self.ghost)
+        return self._stiffness(rate, lambda: self.M * rate if self.ghost is None else self.M * rate + self.ghost)
 
-    def velocity(self, points: MaterialPoints, rate: float) -> PETSc.Vec:
+    def velocity(self, fields: NDArray[np.float64], rate: float) -> PETSc.Vec:
         """Return the velocities of the unknowns, in m/s, projected from the velocities of the points.
 
-        `rate`, in 1/s^2: see `Inertia`.
+        `fields`: result of `affine`.  `rate`, in 1/s^2: see `Inertia`.
         """
-        cut, grid, places, (off, second, _) = self._cut, self._forms.grid, self._pieces.places, self._moments
-        L = columns(velocity_gradients(points)).take(cut.pieces.point, axis=2)
-        v = points.velocity[cut.pieces.point].T + product(L, off[:, None])[:, 0]
-        sent = (cut.pieces_to_cells(np.moveaxis(values, -1, 0)) for values in (v, product(L, second)))
-        v, turn = (self._pieces.volume * np.moveaxis(of, 0, -1) for of in sent)
-        y, moments = places.offset.T, []
-        for bits in corner_bits(grid.dim):
-            axes = bits.nonzero()[0]
-            terms = (prod(y[b] for b in axes if b != a) * turn[:, a] for a in axes)
-            moments.append(places.total(sum(terms, prod(y[a] for a in axes) * v)))
-        of_cells = grid.monomials.T @ grid.over_edges(np.stack(moments, axis=1), places.filled)
-        b = self._forms.work.x.array
-        b[:] = np.bincount(places.nodal.ravel(), of_cells.ravel(), len(b))
-        rhs = self.unknowns.gather(sum_ghosts(self._forms.work), self.unknowns.vector())
-        out = self.unknowns.vector()
+        cut, work = self._cut, self._forms.work
+        sent = cut.pieces_to_cells(fields.take(cut.pieces.point, axis=2).transpose(2, 0, 1))
+        for axis, momenta in enumerate(columns(sent) * self._pieces.volume):
+            work.x.array[axis :: len(fields)] = self._shapes[0] @ momenta.ravel()
+        rhs, out = self.unknowns.gather(sum_ghosts(work), self.unknowns.vector()), self.unknowns.vector()
         rate = max(rate, self._least_rate)
         rhs.scale(rate)
         self._solver.setOperators(self.stiffness(rate))
@@ -349,30 +331,25 @@ class Mass:
         all points keep them.
         `parts`: index (n,) of the connected part of each point, and the number of parts.
         """
-        start, end = velocities
-        seen, change = self._at_points(points, start), self._at_points(points, end - start)
-        out = {name: points.data[name] + change[name] for name in change}
+        change = self._at_points(velocities[1] - velocities[0])
         if moved is not None:
-            rest = replace(points, data=points.data | {name: points.data[name] - seen[name] for name in seen})
-            projected = self._at_points(rest, self.velocity(rest, rate))
-            unseen = {name: rest.data[name] - projected[name] for name in projected}
-            after = replace(points, data=points.data | {name: seen[name] + change[name] for name in seen})
-            excess = self._excess(replace(points, data=points.data | unseen), after, *parts)
-            k = np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0)  # others keep their pieces
-            for name, values in unseen.items():
-                out[name] -= k.reshape(-1, *[1] * (values.ndim - 1)) * values
-        return out
+            seen, now = self._at_points(velocities[0]), affine(points)
+            unseen = now - seen - self._at_points(self.velocity(now - seen, rate))
+            excess = self._excess(points, unseen, seen + change, *parts)
+            change -= np.where(moved > 0, np.maximum(-np.expm1(-RELAXES * moved), excess), 0.0) * unseen
+        rates = product(change[:, 1:], columns(points.F[:, : len(change), : len(change)]))
+        return {VELOCITY: points.velocity + change[:, 0].T, RATE: points.data[RATE] + rates.transpose(2, 0, 1)}
 
     def _excess(
-        self, unseen: MaterialPoints, seen: MaterialPoints, part: NDArray[np.int64], count: int
+        self, points: MaterialPoints, unseen: NDArray, seen: NDArray, part: NDArray[np.int64], count: int
     ) -> NDArray[np.float64]:
         """Return the fraction (n,) of the `unseen` velocities beyond their largest energy, see `carried`."""
-        grid, volume = self._forms.grid, unseen.volume0 * unseen.J
-        L, rate = (columns(velocity_gradients(of)) for of in (unseen, seen))
-        own = (unseen.velocity**2).sum(axis=1) + (product(L, self._moments[2]) * L).sum(axis=(0, 1))
-        within = ((rate**2).sum(axis=0).T * grid.sizes_at(unseen.x) ** 2).sum(axis=1) / 12
-        energies = np.array([np.bincount(part, volume * of, count) for of in (own, within)])
-        own, within = grid.comm.allreduce(energies)
+        grid, (L, rate) = self._forms.grid, (unseen[:, 1:], seen[:, 1:])
+        own = (unseen[:, 0] ** 2).sum(axis=0) + (product(L, self._second[0]) * L).sum(axis=(0, 1))
+        within = ((rate**2).sum(axis=0).T * grid.sizes_at(points.x) ** 2).sum(axis=1) / 12
+        energies = sum_by(part, points.volume0 * points.J * [own, within], count)
+        grid.comm.Allreduce(MPI.IN_PLACE, energies)
+        own, within = energies
         return 1 - np.sqrt(np.divide(within, own, out=np.ones(count), where=own > within))[part]
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
@@ -383,23 +360,43 @@ class Mass:
         return work.x.array.copy()
 
     @cached_property
-    def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Vectors (d, m), in m, from centroids of domains to centroids of pieces, and second moments, in m^2.
-
-        The moments of the pieces (d, d, m) and of the domains (d, d, n) are about their centroids.
-        """
-        pieces = self._cut.pieces
-        off, second = columns(pieces.x - self._cut.mean(pieces.x)[pieces.point]), columns(pieces.second)
-        return off, second, self._mean(off[:, None] * off + second)
+    def _offsets(self) -> NDArray[np.float64]:
+        """Vectors (d, m), in m, from centroids of domains to centroids of pieces."""
+        point = self._cut.pieces.point
+        off = columns(self._cut.pieces.x - self._cut.points.x[point])
+        return off - self._mean(off).take(point, axis=1)
 
     @cached_property
-    def _focus(self) -> NDArray[np.float64]:
-        """Inverses (d, d, n), in 1/m^2, of the second moments of the domains."""
-        return inverses(self._moments[2])
+    def _second(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Second moments (d, d, n) of the domains about their centroids, in m^2, and inverses of these matrices."""
+        second = self._mean(self._offsets[:, None] * self._offsets + columns(self._cut.pieces.second))
+        return second, inverses(second)
+
+    @cached_property
+    def _shapes(self) -> tuple[csc_matrix, csr_matrix]:
+        """Matrix (nodes, (1 + d) m) from momenta of the m pieces to nodes, and from nodes to velocities of the pieces.
+
+        The second matrix is the transpose, but in 3D its gradients are means over pieces.
+        """
+        cut, places = self._cut, self._pieces.places
+        off, second = (columns(cut.pieces_to_cells(of)) for of in (self._offsets.T, cut.pieces.second))
+        grid, d, out = places.grid, places.grid.dim, []
+        nodes = grid.cell_nodes[places.cells]
+        of = grid.over_edges(grid.monomials.T[:, :, None], places.cells)
+        values = sum(of[:, k] * np.multiply.reduce(places.offset.T[bits == 1]) for k, bits in enumerate(corner_bits(d)))
+        index = np.tile(nodes.ravel(), 1 + d), np.arange(0, (1 + d) * nodes.size + 1, 2**d, dtype=nodes.dtype)
+        for at in (places,) if d == 2 else (Places(grid, places.cells, places.x), places):
+            slopes = np.array([sum(of[:, k | 1 << a] * terms for k, terms in at.products[a]) for a in range(d)])
+            moments = (x * values + sum(map(np.multiply, S, slopes)) for x, S in zip(off, second, strict=True))
+            data = np.array([rows.T for rows in (values, *moments)]).ravel()
+            out.append(csr_matrix((data, *index), (len(index[1]) - 1, len(grid.node_x))))
+        return out[0].T, out[-1]
 
     @cached_property
     def _least_rate(self) -> float:
         """Smallest `rate`, in 1/s^2, for which the sum of mass and ghost penalty has half of the digits of the mass."""
+        if self.ghost is None:
+            return 0.0
         ratio = self.ghost.getDiagonal().array_r / self.M.getDiagonal().array_r
         return SAME * self._forms.grid.comm.allreduce(ratio.max(initial=0.0), MPI.MAX)
 
@@ -408,16 +405,18 @@ class Mass:
         pieces = self._cut.pieces
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
-    def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return affine velocity fields: in each domain, the field nearest to the field of the nodal velocities v."""
-        cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
-        d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
-        at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
-        at, slope = (columns(cut.to_pieces(values)) for values in (at, slope.reshape(-1, d, d)))
-        mean, (off, second, _) = self._mean(at), self._moments
-        moment = (at - mean.take(cut.pieces.point, axis=1))[:, None] * off + product(slope, second)
-        rate = product(product(self._mean(moment), self._focus), columns(points.F[:, :d, :d]))
-        return {VELOCITY: mean.T, RATE: rate.transpose(2, 0, 1)}
+    def _at_points(self, v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return affine fields as `affine`: in each domain, the field nearest to the field of the nodal velocities."""
+        cut, d, nodal = self._cut, self._forms.grid.dim, self.local(v)
+        of = np.array([self._shapes[1] @ nodal[axis::d] for axis in range(d)]).reshape(d, 1 + d, -1)
+        out = self._mean(columns(cut.to_pieces(of.transpose(2, 0, 1))))
+        out[:, 1:] = product(out[:, 1:], self._second[1])
+        return out
+
+
+def affine(points: MaterialPoints) -> NDArray[np.float64]:
+    """Return the velocities of the domains (d, 1 + d, n): of the points, in m/s, and velocity gradients, in 1/s."""
+    return np.concatenate([columns(points.velocity)[:, None], velocity_gradients(points).transpose(1, 2, 0)], axis=1)
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
@@ -437,6 +436,7 @@ class Inertia(Loads):
 
     def __init__(self, mass: Mass, flight: PETSc.Vec, rate: float):
         self._mass, self._flight, self.rate = mass, flight, rate
+        self._work, self._forces = flight.duplicate(), flight.duplicate()
 
     @cached_property
     def flight(self) -> NDArray[np.float64]:
@@ -449,13 +449,14 @@ class Inertia(Loads):
 
     def _moved(self, at: At) -> PETSc.Vec:
         """Return the displacements of the unknowns minus the predictor, in m."""
-        u = at.unknowns.gather(at.u, at.unknowns.vector())
+        u = at.unknowns.gather(at.u, self._work)
         u.axpy(-1.0, self._flight)
         return u
 
     def inertia(self, at: At) -> PETSc.Vec:
         """Return the inertia forces at u, in N."""
-        return self._mass.stiffness(self.rate) * self._moved(at)
+        self._mass.stiffness(self.rate).mult(self._moved(at), self._forces)
+        return self._forces
 
     @cached_property
     def rounding_at_unknowns(self) -> NDArray[np.float64]:
@@ -467,7 +468,8 @@ class Inertia(Loads):
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the inertia forces to the residual at fixed nodes."""
         if on is not self._mass.unknowns:
-            residual += self._mass.held_forces(self._moved(at), self.rate)
+            (M, ghost), moved = self._mass.held, self._moved(at)
+            residual += M * moved * self.rate if ghost is None else M * moved * self.rate + ghost * moved
 
     def coupling(self, at: At) -> PETSc.Mat:
         """See `Loads`."""

@@ -76,7 +76,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     unknowns = momentum.system.unknowns
     K = momentum.assemble_tangent()
     if state.stage.inertia:
-        K = K + start.matrices.mass.ghost
+        K = K + start.matrices.mass.stiffness(0.0)
     blocks = {"stiffness": _csr(K), "x": unknowns.positions}
     blocks |= dict(zip(("nodes", "components"), unknowns.nodes, strict=True))
     if storage is not None:

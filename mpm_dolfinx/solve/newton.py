@@ -450,12 +450,12 @@ class Newton:
             if errors.fluid is None:
                 return self._solvers.solve(self._kept, rtol, forces)
             least = errors.fluid.round_off / self._scheme.tolerance
-            measures = forces, np.maximum(errors.exchanged, least)
+            measures, goal = (forces, np.maximum(errors.exchanged, least)), SOLVED * self._scheme.tolerance
             if not slow or self._linear or self._storage.forms.retains:
-                return self._solvers.solve(self._kept, rtol, *measures)
+                return self._solvers.solve(self._kept, rtol, *measures, goal=goal)
             forms = self._momentum.forms
             slope = self._storage.flux_slope(forms.u, self._momentum.system.unknowns, forms.active.now.dofs)
-            count = self._solvers.solve(self._kept, rtol, *measures, slope)
+            count = self._solvers.solve(self._kept, rtol, *measures, slope, goal)
             self._storage.set_fluxes()
             return count
 

@@ -28,7 +28,7 @@ from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageS
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
-from mpm_dolfinx.points.parts import OfParts
+from mpm_dolfinx.points.parts import OfParts, relative
 from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, renew, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
 from mpm_dolfinx.solve.multigrid import multigrid_solver
@@ -221,6 +221,7 @@ class LinearSolvers:
         forces: NDArray[np.float64],
         exchanged: NDArray[np.float64] | None = None,
         slope: FluxSlope | None = None,
+        goal: float = 0.0,
     ) -> int:
         """Solve for (du, dp) with the present residuals, and return the number of coupling iterations.
 
@@ -228,6 +229,7 @@ class LinearSolvers:
         `rtol`: relative tolerance, for each connected part.
         `forces`, `exchanged` (parts,): scales of the residuals: forces (N) and exchanged fluid volume (m^d).
         `slope`: derivative of the fluxes with respect to displacements, if the tangent includes it.
+        `goal`: with inertia, relative residual of the storage after the solve.  The condensed residual may be larger.
         """
         slopes = () if slope is None else (slope,)
         if self._storage is None:
@@ -249,6 +251,9 @@ class LinearSolvers:
         if slope is not None:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))
         g = self.condense(*slopes)
+        if self._storage.moves:
+            off = relative(self._storage.of_parts.sums(np.abs(g.array_r)), exchanged).max(initial=0.0)
+            rtol = min(rtol, goal / min(1.0, max(off, goal)))
         self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
         cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # CG uses preconditioned norms
         self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply if cg else None)

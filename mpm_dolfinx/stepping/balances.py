@@ -18,7 +18,7 @@ from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome, Shares
 from mpm_dolfinx.dynamics.motion_error import motion_error
 from mpm_dolfinx.flow.storage import FluidInertia, Rates, StorageProblem
-from mpm_dolfinx.mechanics.inertia import Flight, Inertia
+from mpm_dolfinx.mechanics.inertia import Flight, Inertia, affine
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
@@ -160,7 +160,7 @@ def flight_of(start: Start) -> Flight | None:
     mass = start.matrices.mass
     if mass is None:
         return None
-    v = mass.velocity(start.state.points, start.rate)
+    v = mass.velocity(affine(start.state.points), start.rate)
     return Flight(v, v)
 
 
@@ -223,7 +223,7 @@ def balances(
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     moves = None
     if inertia is not None:
-        resists = on_grid.resisting_mass(float(substep.own * dt))
+        resists = on_grid.resisting_mass / float(substep.own * dt) ** 2
         forces, of = partial(pushed_back, scene, on_grid), scene.momentum.inertia
         moves = FluidInertia(of.move, forces, resists, scene.fluid.density, inertia.rate)
     options = (*options, moves, on_grid.scale)
@@ -234,4 +234,4 @@ def balances(
 def pushed_back(scene: Scene, on_grid: OnGrid, cells: NDArray[np.int64] | slice) -> NDArray[np.float64]:
     """Return the inertia forces (n, d) on the pore fluid in the chosen filled owned cells, in N/m^3."""
     contents = on_grid.contents
-    return -scene.fluid.density * scene.momentum.inertia.at(contents.filled[cells], contents.shape_values[cells])
+    return -scene.fluid.density * scene.momentum.inertia.at(contents.nodes[cells], contents.shape_values[cells])

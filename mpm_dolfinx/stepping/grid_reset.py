@@ -119,17 +119,18 @@ class OnGrid(Keyed):
                     law = cut.to_cells(quadrature.materials.retention_of(cut.points))
                     self._borders = Borders(self.contents, cut.cells, alike, law, self.facets, self._mixed)
 
-    def resisting_mass(self, seconds: float) -> NDArray[np.float64]:
-        """Return the ratio of inertial to elastic resistance (n,) in the filled owned cells.
+    @cached_property
+    def resisting_mass(self) -> NDArray[np.float64]:
+        """Ratio of inertial to elastic resistance (n,) in the filled owned cells, for a motion in t = 1 s.
 
         Let 2 x 2 cells of Q1 elements have a consistent mass. A displacement of the middle node over the time t has a
-        resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.  `seconds`: t, in s.
+        resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.
         """
         filled, cut = self.contents.filled, self.cut
         density = cut.to_cells(self._materials.present_density(cut.points))
         modulus = self._rows(lambda m: m.macroelement)
         density, modulus = map(self.contents.mean, (density, modulus))
-        return density * (cut.grid.sizes(filled).min(axis=-1) / seconds) ** 2 / (3 * modulus)
+        return density * cut.grid.sizes(filled).min(axis=-1) ** 2 / (3 * modulus)
 
     @property
     def mixes(self) -> bool:
@@ -536,7 +537,7 @@ class Assembled(Keyed):
         own, self.mass = self.momentum, None
         own.set_penalty(loads if stage.inertia else [own.ghost, *loads])
         if stage.inertia:
-            where = on_grid.cut, on_grid.masses, on_grid.fill, on_grid.not_full
+            where = on_grid.cut, on_grid.data.pieces.places, on_grid.masses, on_grid.fill, on_grid.not_full
             self.mass = momentum.inertia.on(*where, own.unknowns, own.held, own.ghost)
             own.mass = self.mass.M
         self.momentum.set_rounding(self._rounding(momentum, loads))
