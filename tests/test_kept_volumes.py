@@ -6,9 +6,11 @@ from dataclasses import replace
 import common
 import numpy as np
 import pytest
+from scipy.sparse.linalg import splu
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.diagnostics.resolution import warn_overlaps
+from mpm_dolfinx.domains import kept_volumes
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import volume_slopes
 from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
@@ -217,3 +219,18 @@ def test_hanging_corners_stay_on_their_edges():
     assert c == pytest.approx(other, abs=1e-12)
     assert abs(np.cross(chord, c - a)) / np.linalg.norm(chord) < 2e-3
     assert domain_volumes(moved, False) == pytest.approx(volume, rel=2e-3)
+
+
+def test_factors_with_many_hanging_corners_remain_sparse(monkeypatch):
+    """In a checkerboard, every fine cell has hanging corners.  The pivots do not leave the diagonal of the matrix."""
+    grid, found = mpm.Grid([0.0, 0.0], [26.0, 26.0], [26, 26]), []
+    coarse, fine = (mpm.box(grid, [1.0, 1.0], [25.0, 25.0], per_cell=k).corners() for k in (1, 4))
+    odd = [np.floor(x.mean(axis=1)).sum(axis=1) % 2 == k for k, x in enumerate((coarse, fine))]
+    before = np.concatenate([coarse[odd[0]], fine[odd[1]]])
+    n = len(before)
+    shift = before + 0.02 * np.sin(7 * before[:, :, ::-1])
+    monkeypatch.setattr(kept_volumes, "splu", lambda A, *a, **k: found.append((A, splu(A, *a, **k))) or found[-1][1])
+    free, ids, number = np.ones(before.shape, dtype=bool), np.arange(n), np.full((n, 4), -1)
+    volume = domain_volumes(before, False)
+    with_volumes(grid, Domains(ids, shift, volume, ids >= 0, free, 0 * ids, number, before))
+    assert found and all(factors.L.nnz + factors.U.nnz < 5 * A.nnz for A, factors in found)

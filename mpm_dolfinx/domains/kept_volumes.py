@@ -126,7 +126,9 @@ def _least(A: csr_matrix, D: csr_matrix, b: NDArray[np.float64]) -> NDArray[np.f
     size = np.hypot(norm(A, axis=1), SOFT)
     A = diags(1 / size) @ A
     augmented = bmat([[identity(A.shape[1]) + D.T @ D, A.T], [A, diags(-((SOFT / size) ** 2))]], "csc")
-    return splu(augmented).solve(np.append(np.zeros(A.shape[1]), b / size))[: A.shape[1]]
+    # quasi-definite, so that pivots on the diagonal are stable in any order (Vanderbei 1995)
+    factors = splu(augmented, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factors.solve(np.append(np.zeros(A.shape[1]), b / size))[: A.shape[1]]
 
 
 class _Hanging(NamedTuple):
