@@ -475,7 +475,8 @@ def balanced(scene: Scene, state: State) -> State:
 
     If the points have the strain of a displacement w, the momentum balance gives an additional displacement u(w). The
     fixed-point iteration `w <- w + u(w)` with Anderson mixing (Walker and Ni 2011) finds w with the smallest u(w).
-    Points store mean strains, so small nodal forces remain. The forces `State.held` balance them.
+    Points store mean strains, so small nodal forces remain. The forces `State.held` balance them.  Gaps do not change
+    with w, so the contact forces are those of the last solution u.
 
     Raises
     ------
@@ -499,10 +500,12 @@ def balanced(scene: Scene, state: State) -> State:
         seen = []
         w = np.zeros_like(forms.u.x.array)
         points = seeded.points
+        pressed = unknowns.vector()
         while count - best[1] < DEPTH / 2:
             forms.u.x.array[:] = w
             problem = _problem(scene, start, replace(seeded, points=points))
             residual, scale = problem.assemble_residual()
+            residual += pressed - _contact(problem)
             left = residual.norm() / max(scale, start.matrices.round_off)
             if left**2 < best[0] ** 2 / 2:
                 unknowns.add(forms.u.x, 1.0, residual)
@@ -513,6 +516,7 @@ def balanced(scene: Scene, state: State) -> State:
             solve_substep(solvers, problem, None, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
             for one in problem.loads:
                 seeded = replace(seeded, points=one.gripped(problem.at, seeded.points))
+            pressed = _contact(problem)
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns.comm, unknowns.owned, seen), count + 1
             forms.u.x.array[:] = w
@@ -531,6 +535,14 @@ def balanced(scene: Scene, state: State) -> State:
         rest = None
     reactions = {name: values for name, values in outcome.items() if name == "reactions"}
     return replace(start.state, points=points, held=held, rest=rest, outcome={**state.outcome, **reactions})
+
+
+def _contact(problem: MomentumProblem) -> Any:
+    """Return minus the nodal forces of contact at u, in N."""
+    out = problem.at.unknowns.vector()
+    for one in (one for one in problem.loads if one.touches):
+        one.push(problem.at, out, problem.at.unknowns)
+    return out
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
