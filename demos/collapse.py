@@ -210,9 +210,9 @@ def main(argv: list[str] | None = None) -> dict:
             )
         common.table([["a", "cells", "run-out / L", "Lube et al.", "off", "energy lost"], *rows])
         under = under_water(o, heaps)
-        out |= {
-            f"water_{k:g}": {"off": off, "run_out": one.run_out, "lost": one.lost} for k, (one, off) in under.items()
-        }
+        for k, (one, apart) in under.items():
+            off = one.run_out / heaps[nearest(heaps)].run_out - 1
+            out[f"water_{k:g}"] = {"off": off, "apart": apart, "run_out": one.run_out, "lost": one.lost}
         given = (o.aspects, o.finer, o.steps, o.grain, o.renewal, o.conductivity)
         usual = given == (list(CELLS), 1.0, STEPS, GRAIN, False, list(CONDUCTIVITIES))
         checked = [entry for entry in (*(f"{a:g}" for a in heaps), f"water_{COARSE:g}") if entry in out]
