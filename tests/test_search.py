@@ -63,8 +63,8 @@ def test_a_direction_that_leads_backwards_is_turned_round(monkeypatch):
     before, forwards = s.state, s.step(1.0)
     there, solve = s.state, LinearSolvers.solve
 
-    def backwards(solvers: LinearSolvers, *how) -> int:
-        count = solve(solvers, *how)
+    def backwards(solvers: LinearSolvers, *how, **goals) -> int:
+        count = solve(solvers, *how, **goals)
         solvers.turn_round()
         return count
 
