@@ -20,9 +20,9 @@ quarter of the height of other cells.
 
 One column, with a = 1, also collapses below a water level. Its porosity is 0.4, and grains of L/100 have a conductivity
 of about 1 m/s for L = 1 m (Kozeny-Carman). Coarse sand moves nearly as dry sand of the same density under gravity
-g' = g (rho - rho_w) / rho, with the density rho of saturated sand. The acceleration of pore water makes a difference.
-In units of L and sqrt(H/g'), the motion of the dry column is therefore the reference. In finer sand, flow of water
-through pores delays the motion.
+g' = g (rho - rho_w) / rho, with the density rho of saturated sand. In units of L and sqrt(H/g'), the motion of the dry
+column is therefore the reference. The acceleration of pore water causes a small difference. In finer sand, flow of
+water through pores delays the motion.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011), J.
 Fluid Mech. 686, 378.
