@@ -18,7 +18,7 @@ from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains.renewed_faces import SeededFaces
-from mpm_dolfinx.grid.grid import FACES
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES
 from mpm_dolfinx.mechanics.inertia import velocity_gradients
 from mpm_dolfinx.points.cutting import cut, domain_volumes, volumes
 from mpm_dolfinx.points.polygons import Polygons
@@ -262,6 +262,33 @@ def test_pressures_act_on_renewed_sides_as_before(monkeypatch, rings):
         moment = [(p.X[:, 0] * a[:, 1]).sum() for p, a in zip(patches, area, strict=True)]
         found.append([*np.sum(area[0], axis=0), *moment, *(p.area0.sum() for p in patches)])
     assert count and found[1] == pytest.approx(found[0], rel=2e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("folded", [True, False])
+def test_the_surface_stays_closed_if_only_some_cells_of_a_domain_can_be_renewed(monkeypatch, folded):
+    """A corner of the block is pushed into the domain below, or the top is slightly above a grid line.
+
+    Without the folded part, or without thin parts above the grid line, the surface would be open.
+    """
+    grid = mpm.Grid([0, 0], [4, 4], [4, 4])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0.25, 0.25], [2.75, 2.25])], [CLAY], walls={})
+    old = yielded(s, 1e-3 * np.diag([1.0, -1.0]))
+    corners = old.corners.copy()
+    if folded:
+        corners[np.linalg.norm(corners - [2.75, 2.25], axis=2) < 1e-9] = [2.6, 1.7]
+    else:
+        corners[:, :, 1] = np.minimum(corners[:, :, 1], 2 + 1e-6)
+    stays = [2.5, 1.5] if folded else [1.5, 2.0]
+    s.state = replace(s.state, watched=old.id[np.linalg.norm(old.x - stays, axis=1) < 1e-9])
+    new, count = renewed(s, replace(old, corners=corners), monkeypatch)
+    found = []
+    for points in (replace(old, corners=corners), new):
+        faces = SeededFaces(s.grid, s.bodies).of(points)
+        first, last = (points.corners[faces.point, FACES[2][faces.face, k]] for k in (0, 1))
+        found.append(np.linalg.norm(last - first, axis=1).sum())
+    assert count and len(s.state.watched) == 1
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+    assert (np.array(FACE_SIGNS)[faces.face] @ (last - first)) == pytest.approx([0, 0], abs=1e-9)
 
 
 SUCTION = {"retention": ("VanGenuchten", {"entry": 2e3, "residual": 0.0, "n": 2.5})}

@@ -109,6 +109,7 @@ class RefilledCells:
     `faces`: surface of the bodies.
     `signs`: keys of seeded faces, and the index of the set of conditions on each of these faces.
     `second`: whether to compute second moments of the pieces.
+    `whole` (n,): whether the domains of points are renewed in all their cells or in none, see `torn`.
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class RefilledCells:
         faces: OuterFaces,
         signs: tuple[NDArray, NDArray],
         second: bool = False,
+        whole: NDArray[np.bool_] | bool = False,
     ):
         self.grid = grid
         self.points = points
@@ -136,6 +138,9 @@ class RefilledCells:
         size = self._areas / self._volume(self.cell)
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
+        self.whole = np.broadcast_to(whole, len(points))
+        while (more := self._all_of(self.whole, excluded) & ~excluded).any():
+            excluded |= more
         elastic = np.zeros(self.cells, dtype=bool)
         elastic[self.cell[~flowed[self.pieces.point]]] = True
         small = (size < SMALL) & ~elastic[self.cell]  # or renewal would spread through elastic soil
@@ -162,6 +167,41 @@ class RefilledCells:
         """Return which points (n,) have a piece in a cell for which `cells` (cells,) is true."""
         out = np.zeros(len(self.points), dtype=bool)
         out[self.pieces.point[cells[self.cell]]] = True
+        return out
+
+    def _all_of(self, domains: NDArray[np.bool_], some: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the cells (cells,) of those of the `domains` (n,) that have a piece or a face in `some` cells."""
+        of = np.concatenate([self.pieces.point, self.faces.point[self.parts.row]])
+        cell = np.concatenate([self.cell, self.parts.cell])
+        reached = np.zeros(len(domains), dtype=bool)
+        reached[of[some[cell]]] = True
+        out = np.zeros(self.cells, dtype=bool)
+        out[cell[(domains & reached)[of]]] = True
+        return out
+
+    @property
+    def torn(self) -> NDArray[np.bool_]:
+        """Which domains (n,) would lose faces on the surface, longer than `GAP` in a cell, or have them twice.
+
+        Removed parts smaller than `CRUMB`, and remainders of folded domains, may lose faces.
+        """
+        parts, new = self.parts, self.remainders[0]
+        of, cell = self.faces.point[parts.row], parts.cell
+        twice = self.chosen[cell] & ~self.affected[of]
+        length = np.linalg.norm(parts.x[:, 1] - parts.x[:, 0], axis=1)
+        length = np.where(self.affected[of] & ~self.chosen[cell], length, 0.0)
+        at, face = np.nonzero(new.parent != NONE)
+        piece = self.remainders[1][new.group[at] - int(self.chosen.sum())]
+        low, high = (new.corners[at, FACES[2][face, k]] for k in (0, 1))
+        kept = np.linalg.norm((high - low) / self.grid.sizes_of(self.cell[piece]), axis=1)
+        place, number = np.unique(
+            np.concatenate([of * self.cells + cell, self.pieces.point[piece] * self.cells + self.cell[piece]]),
+            return_inverse=True,
+        )
+        lost = sum_by(number.ravel(), np.concatenate([length, -kept]), len(place)) > GAP
+        out = np.zeros(len(self.points), dtype=bool)
+        out[of[twice]] = True
+        out[place[lost] // self.cells] = True
         return out
 
     def _excluded(self, free: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
@@ -193,7 +233,9 @@ class RefilledCells:
         more = chosen
         while more.any():
             more = np.zeros(self.cells, dtype=bool)
-            more[cell[self._at(chosen)[of] & small & ~(excluded | chosen)[cell]]] = True
+            more[cell[self._at(chosen)[of] & small]] = True
+            more |= self._all_of(self.whole, chosen)
+            more &= ~(excluded | chosen)
             chosen |= more
         return chosen
 

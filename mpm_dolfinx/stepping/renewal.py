@@ -14,6 +14,7 @@ of a new domain are means over the old domains in its area, corrected to first o
 filled anew if they contain soil whose law cannot yield, several bodies, several crossings of the surface, or a
 prescribed side. Soil that has not yielded is renewed only in cells that it shares with distorted domains of yielded
 soil. Otherwise the parts of yielded domains that enter such a cell would accumulate there.
+Domains whose remaining parts would lose a face on the surface are renewed in all their cells or in none.
 """
 
 from __future__ import annotations
@@ -111,7 +112,10 @@ class Renewal:
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
         masks = self._free(state), self.flowed(points), needs
-        work = RefilledCells(self._grid, points, body, *masks, self._faces.of(points), signs, moves)
+        given = self._grid, points, body, *masks, self._faces.of(points), signs, moves
+        work = RefilledCells(*given)
+        while (torn := work.torn).any():
+            work = RefilledCells(*given, work.whole | torn)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders[0]]
