@@ -47,6 +47,15 @@ def test_clay_seeded_anew_resists_a_rough_bar_as_before(cells, depth, error):
     assert ways == pytest.approx(demo.exact(1), rel=error)
 
 
+def test_clay_resists_a_smooth_bar_evenly_with_four_cells_over_its_diameter(monkeypatch):
+    """Several contact conditions in a cell would lock the clay: error 9.9 %, and 1.3 % between two steps in a cell."""
+    monkeypatch.setattr(demo, "HALF", 2.0)  # a narrower block is faster
+    run = demo.push(0.0, 4, 0.125)
+    last = np.array(run.N)[run.steady]
+    assert last.mean() == pytest.approx(demo.exact(0), rel=0.08)
+    assert np.ptp(last) < 0.005 * last.mean()
+
+
 @pytest.mark.slow
 def test_lines_that_follow_the_bar_find_the_resistance_in_a_quarter_of_the_cells():
     """The resistance agrees with that in equal cells to a per cent."""

@@ -17,6 +17,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumProblem
 E = 1e6  # Pa
 SOIL = mpm.Hencky(bulk=E / 3, shear=E / 2)  # nu = 0
 GEL = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000, porosity=0.5)
+CLAY = mpm.DruckerPrager(bulk=1e6, shear=6e5, friction=0.0, dilation=0.0, cohesion=1e6)
 
 
 def turned(angle):
@@ -263,14 +264,14 @@ def test_adhesion_bounds_the_shear():
     assert s.tool_forces.array[0, 0] == pytest.approx(2e3, rel=0.02)
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.4])
-def test_the_tangent_of_the_contact_is_its_derivative(friction):
-    """A step in which a disc rotates and slips."""
+@pytest.mark.parametrize(("friction", "soil"), [(0.0, GEL), (0.4, GEL), (0.0, CLAY), (0.4, CLAY)])
+def test_the_tangent_of_the_contact_is_its_derivative(friction, soil):
+    """A step in which a disc rotates and slips.  In clay, the pairs of a cell share their pressure."""
     grid = mpm.Grid([-0.25, 0], [1.25, 1], [12, 8])
     disc = mpm.Ball((0.5, 0.71), 0.2)
     motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation_rad": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
     tool = mpm.Tool(disc, **motion, friction=friction)
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], walls={"bottom": "xy"}, conditions=[tool])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [soil], walls={"bottom": "xy"}, conditions=[tool])
     s.step(0.5)
     momentum: MomentumProblem = set_up(s, 0.5).momentum
     rng, forms, unknowns = np.random.default_rng(1), momentum.forms, momentum.system.unknowns

@@ -417,7 +417,8 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
 
     A nearly incompressible Q1 field cannot follow a curved side, so the penalty must not be much stiffer than the shear
     stiffness.  In an undrained cavity, the penalty modulus 300 (lambda + 2G) gives up to 1.9 times the exact pressure.
-    The modulus 30 (4G) gives 1.01 times the exact pressure.
+    The modulus 30 (4G) gives 1.01 times the exact pressure.  Below tools, this modulus is the penalty for gaps that
+    deviate from the mean gap of a cell.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 

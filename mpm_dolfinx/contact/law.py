@@ -2,13 +2,21 @@
 """Contact law: pressure, Coulomb friction and adhesion.
 
 A *contact pair* is a quadrature point on a surface with its opposite position.  All pairs of one contact in one cell
-form a *condition*.  At a pair with gap g, the contact pressure p and its energy psi per area are
+form a *condition*.  At a pair with gap g, the contact pressure p is
 
-    p = <lambda - k g>,     psi = p^2 / (2 k).
+    p = <lambda + q - k_s g>,     A q = (1 - k_s / k) int (p - lambda) dA.
 
-<...> is the positive part, and k is a penalty stiffness.  Each condition has one multiplier lambda.  In the first
-iteration, lambda is the pressure after the previous step.  Augmentation (Uzawa's method) updates lambda until the
-penetrated volume in each cell is below `DEPTH` cell volumes.
+<...> is the positive part, and the integral is over the area A of the condition.  If all pairs touch, this means
+
+    p = lambda - k g_m - k_s (g - g_m)
+
+with the mean gap g_m.  For elastic bodies, and between groups, k_s equals the penalty stiffness k.  Tools on soils that
+yield have a lower stiffness k_s, see `holding`, because several conditions lock a cell of nearly incompressible soil.
+The pressures derive from a convex energy.
+
+Each condition has one multiplier lambda.  In the first iteration, lambda is the pressure after the previous step.
+Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below `DEPTH` cell volumes.
+Below tools on soils that yield, single pairs may be deeper, by p / k_s.
 
 With inertia, k contains the part k_i = `STIFF` rho h / (GAMMA dt)^2, which resists only the motion in the step.  The
 term k g is then k g - k_i min(0, g_0), with the gap g_0 at the start of the step.  Otherwise a short step would remove
@@ -91,7 +99,10 @@ class Touch:
 
     force: NDArray[np.float64]  # force on the points (m, d), N
     push: NDArray[np.float64]  # pressure (m,), Pa
-    stiff: NDArray[np.float64]  # minus the derivative of the pressure with respect to the gap (m,), Pa/m
+    stiff: NDArray[np.float64]  # stiffness k_s (m,), Pa/m; 0 if the pair does not touch
+    # minus the derivative of the pressure of a pair with respect to another gap of the condition, per area of the other
+    # pair (k,), Pa/m^d, if both touch; minus the derivative with respect to the own gap is `stiff` plus such a term
+    joint: NDArray[np.float64]
     pressure: NDArray[np.float64]  # mean pressure (k,), Pa
     sticks: NDArray[np.bool_]  # whether the condition is in contact and sticks (k,)
     trial: NDArray[np.float64]  # shear traction in stick (k, d), Pa
@@ -118,11 +129,15 @@ class ContactLaw:
         self.strength = strength[key // self.grid.num_local]
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
-        self._modulus, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
         inertial = STIFF * of_pairs * pairs.inertia
-        self._stiffness = self._modulus + inertial
+        stiffness = STIFF / of_pairs * pairs.resistance + inertial
+        resistance, holding, self._stiffness = self.mean(np.array([pairs.resistance, pairs.holding, stiffness]).T).T
+        self._modulus, self._hold = STIFF / h * resistance, GRIP / h * resistance
+        self._share = holding / np.maximum(resistance, TINY)
+        self._of_pairs = (self._stiffness * self._share)[self.of]
+        self._rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         self._sunk = np.where(inertial > 0, pairs.sunk, 0.0)
-        self._kept = inertial * self._sunk
+        self._kept = inertial / stiffness * self._sunk
         self.frictional = any(contact.frictional for contact in contacts)
 
     def begins(self) -> ContactState:
@@ -136,22 +151,21 @@ class ContactLaw:
         return means_of_rows(self.of, self.pairs.area, values, len(self.area))
 
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
-        """Return the penalty stiffness k (m,), in Pa/m, of the pairs."""
-        return state.updates[self.of, 0] * self._stiffness
+        """Return the stiffness k (k,), in Pa/m, of the conditions."""
+        return state.updates[:, 0] * self._stiffness
+
+    def pair_stiffness(self, state: ContactState) -> NDArray[np.float64]:
+        """Return the stiffness k_s (m,), in Pa/m, of the pairs."""
+        return state.updates[self.of, 0] * self._of_pairs
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
         """Return the contact forces on the pairs, and the derivatives of these forces."""
-        stiffness = self.stiffness(state)
-        push = state.pressure[self.of] + state.updates[self.of, 0] * self._kept
-        push = np.maximum(0.0, push - stiffness * at.gap)
-        # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
-        rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
-        touches = (push > 0) | (at.gap - self._sunk <= rounding)
+        push, touches, joint = self._pressures(state, at.gap)
         on = np.zeros(len(self.area), dtype=bool)
-        if not touches.any():
+        if joint is None:
             grip = np.zeros((len(on), self.grid.dim, self.grid.dim))
             none, rows = grip[:, 0, 0], grip[:, 0]
-            return Touch(push[:, None] * at.n, push, push, none, on, rows, rows, none, grip, rows)
+            return Touch(push[:, None] * at.n, push, push, none, none, on, rows, rows, none, grip, rows)
         pressure = self.mean(push)
         normal = self.mean(at.n)
         on[self.of[touches]] = True
@@ -159,7 +173,27 @@ class ContactLaw:
         means = self.mean(at.slip), self.mean(at.shear)
         friction = _, _, shear, *_ = self._friction(state, normal, *means, pressure, on)
         force = self.pairs.area[:, None] * (push[:, None] * at.n + shear[self.of])
-        return Touch(force, push, stiffness * touches, pressure, *friction)
+        return Touch(force, push, self.pair_stiffness(state) * touches, joint, pressure, *friction)
+
+    def _pressures(self, state: ContactState, gap: NDArray) -> tuple[NDArray, NDArray[np.bool_], NDArray | None]:
+        """Return pressures (m,) at gaps (m,), which pairs (m,) touch, and `Touch.joint` (k,), or None without touch."""
+        of, area = self.of, self.pairs.area
+        k = len(self.area)
+        more, parted = 1 / np.maximum(self._share, TINY) - 1, self.area
+        at = self.pair_stiffness(state) * (gap - self._kept)
+        bears, push = np.zeros(len(gap), dtype=bool), state.pressure / (1 + more)  # lambda + q if no pair touches
+        # Newton's method; lambda + q increases, so no pair parts
+        while np.logical_or.reduce(new := (at < push[of]) & ~bears):
+            bears |= new
+            parted = sum_by(of, area * ~bears, k)
+            q = -more * (sum_by(of, area * bears * at, k) + parted * state.pressure)
+            push = state.pressure + q / np.maximum(self.area + more * parted, TINY)
+        # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
+        touches = bears | (gap - self._sunk <= self._rounding)
+        if not np.logical_or.reduce(touches):
+            return np.zeros(len(gap)), touches, None
+        whole = np.maximum(self.area + more * sum_by(of, area * ~touches, k), TINY)
+        return bears * np.maximum(0.0, push[of] - at), touches, self.stiffness(state) * self._share * more / whole
 
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
@@ -181,42 +215,52 @@ class ContactLaw:
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
         """Return the matrix D (m d, m d): minus the derivative of forces with respect to relative displacements."""
-        pairs = self.pairs
-        d = self.grid.dim
-        m = len(self.pairs.cell)
+        d, area = self.grid.dim, self.pairs.area
+        m, k = len(self.of), len(self.area)
         own = touch.stiff[:, None, None] * at.n[:, :, None] * at.n[:, None, :]
         if at.curvature is not None:
             own = own - touch.push[:, None, None] * at.curvature
-        own = pairs.area[:, None, None] * own
+        own = area[:, None, None] * own
         D = scipy.sparse.bsr_matrix((own, np.arange(m), np.arange(m + 1)), shape=(m * d, m * d)).tocsr()
-        if not self.frictional:
+        shared = touch.joint.any()
+        if not (shared or self.frictional):
             return D
-        # means of displacements and pressures over the pairs of each condition
-        share = pairs.area / self.area[self.of]
-        mean = scipy.sparse.csr_matrix((share, (self.of, np.arange(m))), shape=(len(self.area), m))
-        wide = scipy.sparse.kron(mean, scipy.sparse.identity(d), format="csr")
-        k, whole = len(self.area), self.area[:, None, None]
+        normal = scipy.sparse.bsr_matrix((at.n[:, None], np.arange(m), np.arange(m + 1)), shape=(m, m * d))
+        total = scipy.sparse.csr_matrix((area, (self.of, np.arange(m))), shape=(k, m))  # integrals over conditions
+        touches = (touch.stiff > 0).astype(float)
+        touching = total @ scipy.sparse.diags(touches) @ normal
+        if shared:
+            D = D + touching.T @ scipy.sparse.diags(touch.joint) @ touching
+        if not self.frictional:
+            return D.tocsr()
+        wide = scipy.sparse.kron(scipy.sparse.diags(1 / np.maximum(self.area, TINY)) @ total, scipy.sparse.identity(d))
         blocks = (np.arange(k), np.arange(k + 1))
-        grip = scipy.sparse.bsr_matrix((whole * touch.grip, *blocks), shape=(k * d, k * d))
-        by_pressure = scipy.sparse.bsr_matrix((whole * touch.by_pressure[:, :, None], *blocks), shape=(k * d, k))
-        pressed = (touch.stiff[:, None] * at.n)[:, None]
-        slope = scipy.sparse.bsr_matrix((pressed, np.arange(m), np.arange(m + 1)), shape=(m, m * d))
-        return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
+        grip = scipy.sparse.bsr_matrix((self.area[:, None, None] * touch.grip, *blocks), shape=(k * d, k * d))
+        by_pressure = scipy.sparse.bsr_matrix((touch.by_pressure[:, :, None], *blocks), shape=(k * d, k))
+        pressed = total @ scipy.sparse.diags(touch.stiff) @ normal
+        pressed = pressed + scipy.sparse.diags(touch.joint * (total @ touches)) @ touching
+        return (D + wide.T @ (grip @ wide + by_pressure @ pressed)).tocsr()
+
+    def _pressed(self, touch: Touch, closing: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the linearised increases (m,) of the pressures, if gaps decrease by `closing` (m,)."""
+        touches = touch.stiff > 0
+        joint = touch.joint * sum_by(self.of, self.pairs.area * touches * closing, len(self.area))
+        return touch.stiff * closing + touches * joint[self.of]
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
         """Return `D v` for vectors v (m, d) and the matrix D of `tangent`, or `D^T v` if `adjoint`."""
-        area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
+        across = self._pressed(touch, (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:
             out = out - touch.push[:, None] * np.einsum("mij,mj->mi", at.curvature, v)
         if self.frictional:
             mean = self.mean(v)
             if adjoint:
-                out = out + touch.stiff[:, None] * at.n * (touch.by_pressure * mean).sum(axis=1)[self.of, None]
+                out = out + self._pressed(touch, (touch.by_pressure * mean).sum(axis=1)[self.of])[:, None] * at.n
             else:
                 out = out + (touch.by_pressure * self.mean(across))[self.of]
             out = out + np.einsum("kji,kj->ki" if adjoint else "kij,kj->ki", touch.grip, mean)[self.of]
-        return area * out
+        return self.pairs.area[:, None] * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
         """Update the set of slipping conditions.  Return the new state, and whether this set has changed.
@@ -250,7 +294,7 @@ class ContactLaw:
         plane = sum_by(self.of, plane, len(self.area))
         whole = np.minimum(1.0, plane / self.grid.smallest_faces(self.cell))
         # with inertia the allowed penetration decreases as the stiffness increases
-        stiffness = self.mean(state.updates[self.of, 0] * self._modulus)
+        stiffness = state.updates[:, 0] * self._modulus
         off = whole * np.abs(touch.pressure - state.pressure) / stiffness / self._size
         most = largest(off)
         if not over_all(self.grid.comm, int((most > DEPTH).sum())):
@@ -271,7 +315,7 @@ class ContactLaw:
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
         """Return the rounding errors (m,), in N, of the forces on the pairs."""
         of_gap = 4 * EPSILON * self.pairs.largest_coordinate
-        return of_gap * self.stiffness(state) * self.pairs.area
+        return of_gap * self.stiffness(state)[self.of] * self.pairs.area
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""

@@ -198,7 +198,7 @@ class MovedTools(ContactProblem):
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)
-        k = law.stiffness(state)
+        k = law.pair_stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
             far = found.at.gap - state.pressure[law.of] / k + self._moved.load[of] / (k * self.pairs.area * along)
             far = np.where(along > 0, far / along, np.inf)

@@ -54,7 +54,7 @@ class Facets(NamedTuple):
     x: NDArray[np.float64]  # position (n, d), m
     face: NDArray[np.int64]  # index of the face in its `Surface` (n,)
     cell: NDArray[np.int64]  # lexicographic index of the cell (n,)
-    stiffness: NDArray[np.float64]  # modulus and density (n, 2), see `Touching._stiffness`
+    stiffness: NDArray[np.float64]  # moduli and density (n, 3), see `Touching._stiffness`
     corners: NDArray[np.float64]  # current corners of the face (n, 2^(d-1), d), m
     cut: NDArray[np.float64]  # corners of the face at the last grid reset (n, 2^(d-1), d), m
     outward: NDArray[np.float64]  # outward unit normal (n, d)
@@ -148,7 +148,7 @@ class Contacts(Touching):
             if self.contacts[number].frictional:
                 old = _rotated(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
-            stiffness = np.minimum(own[at], now.stiffness[other]) * [1.0, place.rate]
+            stiffness = np.minimum(own[at], now.stiffness[other])[:, [0, 0, 2]] * [1.0, 1.0, place.rate]
             serial = (i + grid.comm.rank * len(self._faces)) * PLACES + row
             outward = patches.area(points)[row] if self.conducts else np.zeros((len(row), 0))
             fixed = np.full((len(row), 2), [number, sign])
@@ -162,8 +162,8 @@ class Contacts(Touching):
         exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, sign, serial = sent[:, :3].T.astype(np.int64)
-        x, y, n, offset, shear, outward = np.split(sent[:, 7:], d * np.arange(1, 6), axis=1)
-        own = number, grid.locals[cell], *sent[:, 3:7].T, shear, x, sign
+        x, y, n, offset, shear, outward = np.split(sent[:, 8:], d * np.arange(1, 6), axis=1)
+        own = number, grid.locals[cell], *sent[:, 3:8].T, shear, x, sign
         pairs = FacePairs(grid, *own, other, y, n, offset, serial, outward)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
             exchange, at, values[:, 0].astype(np.int64), values[:, 3]
@@ -204,7 +204,7 @@ class Contacts(Touching):
         whole = np.column_stack([patches.face, patches.cell])
         rows = np.column_stack([patches.now(points), stiffness, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
-        x, stiffness, now, then, outward = np.split(rows, np.cumsum([d, 2, k, k]), axis=1)
+        x, stiffness, now, then, outward = np.split(rows, np.cumsum([d, 3, k, k]), axis=1)
         shape = (len(rows), 2 ** (d - 1), d)
         return Facets(x, *whole.T, stiffness, now.reshape(shape), then.reshape(shape), outward)
 

@@ -45,6 +45,7 @@ class Pairs:
     cell: NDArray[np.int32]  # local cell of the point (m,)
     area: NDArray[np.float64]  # area of the surface that the point represents (m,), m^(d-1)
     resistance: NDArray[np.float64]  # reference modulus, the lower value of both sides (m,), Pa, see `conditions`
+    holding: NDArray[np.float64]  # for tools on soils that yield a lower modulus (m,), Pa, see `conditions`
     inertia: NDArray[np.float64]  # density / (GAMMA dt)^2, the lower value of both sides (m,), Pa/m^2; 0 in statics
     pressure: NDArray[np.float64]  # contact pressure at the point before the step (m,), Pa
     shear: NDArray[np.float64]  # shear traction at the point before the step (m, d), Pa

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
-from mpm_dolfinx.conditions.conditions import resistance
+from mpm_dolfinx.conditions.conditions import holding, resistance
 from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
@@ -72,8 +72,9 @@ class Touching(Acting):
         self.symmetric = not any(self._frictional)
 
     def _stiffness(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the reference modulus, in Pa, and the density, in kg/m^3, of each point, as columns (n, 2)."""
-        return np.column_stack([self._materials.table(points, resistance), self._materials.present_density(points)])
+        """Return `resistance` and `holding`, in Pa, and the density, in kg/m^3, of each point, as columns (n, 3)."""
+        moduli = [self._materials.table(points, of) for of in (resistance, holding)]
+        return np.column_stack([*moduli, self._materials.present_density(points)])
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the initial contact pressures and shear tractions of n points, all zero."""

@@ -219,7 +219,7 @@ class Tools(Touching):
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
         unit, around = area / np.maximum(size, TINY)[:, None], np.broadcast_to(grid.around(x), size.shape)
-        stiffness = self._stiffness(cut.points)[patches.at] * [1.0, place.rate]
+        stiffness = self._stiffness(cut.points)[patches.at] * [1.0, 1.0, place.rate]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
@@ -252,8 +252,8 @@ class Tools(Touching):
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, sent = exchange.send(patches.cell[at]), exchange.send(values)
-        number, *own, start_gap, side_gap = sent[:, :7].T
-        places, now, carried, side, shear = np.split(sent[:, 7:], 5, axis=1)
+        number, *own, start_gap, side_gap = sent[:, :8].T
+        places, now, carried, side, shear = np.split(sent[:, 8:], 5, axis=1)
         acts = np.ones(len(number)), self.tools, poses, now, carried, start_gap, side_gap, side
         pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
