@@ -221,6 +221,22 @@ def test_hanging_corners_stay_on_their_edges():
     assert domain_volumes(moved, False) == pytest.approx(volume, rel=2e-3)
 
 
+@pytest.mark.parametrize("width", [1e-2, 1e-3])
+def test_corners_of_thin_domains_move_less_than_their_width(width):
+    """Two thin domains lie beside a cell.  Their volumes are 10 % too large and too small, and one side is held."""
+    grid = mpm.Grid([0.0, 0.0], [4.0, 4.0], [4, 4])
+    wide = mpm.box(grid, [1.0, 1.0], [2.0, 2.0], per_cell=1).corners()
+    thin = mpm.box(grid, [2.0, 1.0], [3.0, 2.0], per_cell=2).corners()
+    thin = [2.0, 0.0] + (thin[thin.mean(axis=1)[:, 0] < 2.5] - [2.0, 0.0]) * [2 * width, 1.0]
+    corners = np.concatenate([wide, thin])
+    free, ids, number = np.ones(corners.shape, dtype=bool), np.arange(3), np.full((3, 4), -1)
+    free[:, :, 0] = corners[:, :, 0] < 2 + width / 2
+    volume = domain_volumes(corners, False) * [1.0, 0.9, 1.1]
+    moved = with_volumes(grid, Domains(ids, corners, volume, ids >= 0, free, 0 * ids, number, corners))
+    assert domain_volumes(moved, False) == pytest.approx(volume, rel=1e-3)
+    assert np.abs(moved - corners).max() < width
+
+
 def test_factors_with_many_hanging_corners_remain_sparse(monkeypatch):
     """In a checkerboard, every fine cell has hanging corners.  The pivots do not leave the diagonal of the matrix."""
     grid, found = mpm.Grid([0.0, 0.0], [26.0, 26.0], [26, 26]), []

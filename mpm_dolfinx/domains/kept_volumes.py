@@ -49,10 +49,10 @@ Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the res
 """
 
 OF_CELL = 1 / 16
-"""Fraction of a cell whose volume is added to the weight of d at hanging corners and at the ends of their edges.
+"""Least weight of d at corners of renewed domains, divided by the volume of a cell.
 
-Without it, corners of very thin domains would move far to close narrow gaps.  Source: definition, the share of a corner
-in one of the four new domains of a full cell.
+Without it, corners of very thin domains would move far, also out of the surface.  Source: definition, the share of a
+corner in one of the four new domains of a full cell.
 """
 
 
@@ -97,7 +97,8 @@ def _motion(grid: Grid, domains: Domains) -> tuple[NDArray[np.float64], bool]:
     share = whole[:, None] / corners / grid.sizes_at(domains.corners[yielded].mean(axis=1)) ** 2
     weight = sum_by(at.ravel(), share.T.repeat(corners, axis=1), count).T
     hangs = _hanging(grid, domains, number, ~held.all(axis=1) & (weight > 0).all(axis=1))
-    weight[np.unique(hangs.corners)] += OF_CELL
+    renewed = number[domains.number < 0]
+    weight[renewed] = np.maximum(weight[renewed], OF_CELL)
     scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
     ends = [(k, k + 2**a) for a in range(d) for k in range(corners) if not k >> a & 1]
     edge, of = np.unique(np.sort(at[:, ends]).reshape(-1, 2) @ [count, 1], return_inverse=True)
