@@ -48,11 +48,11 @@ Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the res
 1.1e-07. Finer cells change it by 9.1e-02.
 """
 
-OF_CELL = 1 / 16
-"""Least weight of d at corners of renewed domains, divided by the volume of a cell.
+OF_CELL = 1 / 4
+"""Smallest V_p in the third sum for renewed domains, divided by the volume of a cell.
 
-Without it, corners of very thin domains would move far, also out of the surface.  Source: definition, the share of a
-corner in one of the four new domains of a full cell.
+Without it, corners of very thin domains would move far, also out of the surface.  Source: definition, the volume of one
+of the four new domains of a full cell.
 """
 
 
@@ -94,11 +94,12 @@ def _motion(grid: Grid, domains: Domains) -> tuple[NDArray[np.float64], bool]:
     now, slope = volume_slopes(domains.corners[yielded], grid.axisymmetric)
     at, whole = number[yielded], domains.volume[yielded]
     n, corners = at.shape
-    share = whole[:, None] / corners / grid.sizes_at(domains.corners[yielded].mean(axis=1)) ** 2
+    middle = domains.corners[yielded].mean(axis=1)
+    size = grid.sizes_at(middle)
+    least = OF_CELL * size.prod(axis=-1) * grid.around(middle) * (domains.number[yielded, 0] < 0)
+    share = np.maximum(whole, least)[:, None] / corners / size**2
     weight = sum_by(at.ravel(), share.T.repeat(corners, axis=1), count).T
     hangs = _hanging(grid, domains, number, ~held.all(axis=1) & (weight > 0).all(axis=1))
-    renewed = number[domains.number < 0]
-    weight[renewed] = np.maximum(weight[renewed], OF_CELL)
     scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
     ends = [(k, k + 2**a) for a in range(d) for k in range(corners) if not k >> a & 1]
     edge, of = np.unique(np.sort(at[:, ends]).reshape(-1, 2) @ [count, 1], return_inverse=True)
