@@ -34,7 +34,7 @@ simulation.stage(
         mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5))),
     ],
 )
-result = simulation.run(1.0, 0.25, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 shear, push = points.data["contact_shear"], points.data["contact_pressure"]
 forces = {"forces": simulation.tool_forces.array, "walls": simulation.wall_reactions.array}

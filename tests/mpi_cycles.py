@@ -18,7 +18,7 @@ def cycled(dim):
     bodies = [mpm.box(grid, lower, [0.55, *upper[1:]]), mpm.box(grid, [0.55, *lower[1:]], upper, material=3 - dim)]
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-8e3 * (1 - abs(2 * (t % 1) - 1))])
     s = mpm.Simulation(grid, bodies, [SOFT, CLAY], walls={"left": "xyz"[:dim]}, conditions=[load])
-    s.run(1.5, 0.25, progress=False)
+    s.run(1.5, 0.5, progress=False)
     return s
 
 

@@ -48,7 +48,7 @@ simulation = mpm.Simulation(
     ],
     terms=[push, mpm.Source(lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx)],
 )
-result = simulation.run(1.0, 0.25, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 columns = {name: points.data[name] for name in ("plastic", "hardened")}
 if state := gathered(simulation, p=points.pressure, stress=simulation.effective_stress(), **columns):

@@ -23,7 +23,7 @@ simulation = mpm.Simulation(
     numerics=mpm.Numerics(tolerance=1e-10),
 )
 X = np.random.default_rng(1).uniform(0, [1.7, 2.9], (60, 2))
-result = simulation.run(4e4, 1e4, probes=mpm.probes(simulation.bodies, X), progress=False)
+result = simulation.run(2e4, 1e4, probes=mpm.probes(simulation.bodies, X), progress=False)
 probed = result.probe_pressure[-1]
 if state := gathered(simulation, p=simulation.points.pressure):
     np.savez(sys.argv[1], **state, probed=probed, balance=result.balance)

@@ -15,6 +15,7 @@ import sys
 from argparse import ArgumentParser
 from collections import Counter
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from random import Random
 from statistics import median
@@ -166,6 +167,7 @@ def entry(found: re.Match) -> str:
     return f"\n{found[1]}{found[2]}: " if found[2] else f"\n{found[3]}"
 
 
+@cache
 def places() -> list[tuple[str, str]]:
     """Return the places, file:line, and all sentences of docstrings, messages and pages."""
     out = []

@@ -91,5 +91,5 @@ trap - EXIT
 
 [ $# -gt 0 ] || set -- -n "$(env -u OMP_NUM_THREADS nproc)" --dist loadfile
 in_tree OMP_NUM_THREADS="$OMP_NUM_THREADS" MPLBACKEND="$MPLBACKEND" OMPI_MCA_btl="$OMPI_MCA_btl" \
-    OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 OMPI_MCA_mpi_yield_when_idle=1 PYTHONPATH=/src PYTHONDONTWRITEBYTECODE=1 \
+    OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 OMPI_MCA_mpi_yield_when_idle=1 PYTHONPATH=/src PYTHONPYCACHEPREFIX=/root/.cache/python \
     python3 -m pytest -p no:cacheprovider "$@"

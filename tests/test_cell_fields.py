@@ -15,13 +15,13 @@ def test_fields_of_the_cells_are_of_second_order():
     On twice as many cells again, the order of stresses is 1.6, with linear or constant gradients in domains.
     """
     errors = []
-    for cells in (6, 12, 24):
+    for cells in (6, 24):
         s = made.scene(cells)
         for _ in range(2 * cells):
             s.step(6.0 / cells)
         errors.append(made.errors_of_cells(s))
     errors = np.array(errors)
-    assert np.log2(errors[0] / errors[2]).min() / 2 > 1.65 and errors[-1].max() < 1.5e-3, errors
+    assert np.log2(errors[0] / errors[1]).min() / 2 > 1.65 and errors[-1].max() < 1.5e-3, errors
 
 
 @pytest.mark.parametrize("load", [1e-6, 0.1], ids=["points that stay in their cells", "points that leave them"])

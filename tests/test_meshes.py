@@ -85,7 +85,7 @@ def test_a_linear_field_is_exact_however_the_mesh_lies(kind):
     H = np.array([[0.05, 0.1, 0.02], [-0.03, -0.08, 0.04], [0.01, 0.06, 0.03]])[:dim, :dim]
     sides = [mpm.Displacement(name, lambda t, X: t * X @ H.T) for name in body.names]
     s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=sides)
-    s.run(1.0, 0.5, progress=False)
+    s.run(1.0, 1.0, progress=False)
     assert s.points.F == pytest.approx(np.tile(np.eye(dim) + H, (len(s.points), 1, 1)), abs=2e-3)
 
 

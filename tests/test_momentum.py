@@ -69,8 +69,8 @@ def test_a_step_longer_than_the_run_is_one_step(dt):
 
 def test_the_answer_does_not_depend_on_the_number_of_steps():
     tips = []
-    for n in (10, 40, 80):
-        s, probe = beam(fluid=False, ramp=1.0, h=0.015)
+    for n in (10, 80):
+        s, probe = beam(fluid=False, ramp=1.0, h=0.02)
         tips.append(s.run(1.0, 1 / n, probes=probe).displacement[-1][0, 1])
     assert np.ptp(tips) < 5e-4 * abs(tips[0])
 

@@ -293,10 +293,11 @@ def test_forces_and_fluid_are_in_balance_on_lines_that_swing(body, tools, size):
 def test_lines_follow_in_3d_with_all_balances_and_a_run_goes_on_with_the_same_bits(follows, tmp_path):
     ends, file = [], tmp_path / "kept"
     for parts in (1, 2):
-        s, again = (in_3d.pushed(follows) for _ in range(2))
+        s = in_3d.pushed(follows)
         result = s.run(0.05, 0.05, progress=False, checkpoint=mpm.Checkpoint(file))
         if parts == 2:
-            s, result = again, mpm.resume(again, file)
+            s = in_3d.pushed(follows)
+            result = mpm.resume(s, file)
         result = s.run(0.1, 0.05, progress=False, after=result)
         ends.append(s.points)
         before, report = s.points, s.step(0.025)
