@@ -11,14 +11,13 @@ The clay is a block, eight diameters wide and high, between smooth walls. Half o
 the top keeps the gap behind the bar closed. In a narrower block the resistance is lower. In a block four diameters
 wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 cells.
 
-Clay that flows around the bar stretches by a factor of about e^4 for each diameter of depth. After each quarter of a
-diameter, the clay is therefore seeded with new points, which take over the stresses (Hu and Randolph 1998). After each
-new seeding, N is lower for one or two steps. Errors refer to the mean of N over the last quarter of the distance
-between two seedings. `spread` is the range of N over the same distances, divided by this mean.
+Clay that flows around the bar stretches by a factor of about e^4 for each diameter of depth. New domains therefore
+replace domains longer than a cell (`renewal`). Errors refer to the mean of N over the last quarter of a diameter.
+`spread` is the range of N over this distance, divided by the mean.
 
 A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates V. The rate is
 `V = v D / c_v`, with the velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so
-the clay starts without effective stress. Wet clay is seeded only once. New domains replace domains longer than a cell.
+the clay starts without effective stress.
 
 With --follow the bar is pushed once more, on grid lines that follow the bar. The number of cells does not change.
 """
@@ -26,12 +25,10 @@ With --follow the bar is pushed once more, on grid lines that follow the bar. Th
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import common
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 import mpm_dolfinx as mpm
 
@@ -41,9 +38,8 @@ STRENGTH, PRESSURE = 1e3, 2e4  # Pa: s_u of the undrained clay, and the pressure
 SHEAR = 100 * STRENGTH
 ROUGH = (0.0, 0.5, 1.0)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
-LEG, STEADY = 0.25, 0.75  # diameters between seedings; fraction of this distance after which N is used
-BEARS = 0.999  # largest stress after a new seeding, as a fraction of the strength
-STEP, WET_STEP = 1 / 24, 1 / 18  # motion of the bar in a step, in cell sizes: dry and wet clay
+STEADY = 0.25  # last part of the depth in which N is used, in diameters
+STEP, WET_STEP = 1 / 12, 1 / 18  # motion of the bar in a step, in cell sizes: dry and wet clay
 CLAY = mpm.DruckerPrager(2 * SHEAR, SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH, conductivity=1e-9)
 WATER = mpm.Fluid()
 CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
@@ -77,7 +73,7 @@ def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
     at = np.interp(np.linspace(0, np.pi, around + 1), np.pi * np.array([0, 1, 3, 4]) / 4, corners)
     size = np.array([outward, len(at) - 1]) * h / 2
 
-    top = ((0, size[1] - around / 4 * h / 2 - HALF - 1e-9), tuple(size))
+    top = ((0, size[1] - around / 4 * h / 2 - HALF), tuple(size))
 
     def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the sides of the block, with increasing size
         angle = np.interp((X[:, 1] + HALF) / (h / 2), np.arange(len(at)), at)
@@ -112,63 +108,27 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Load the clay, then push a bar of roughness alpha to `depth` diameters, with new points after each `LEG`."""
-    out, stress, legs = Push(), None, max(1, round(depth / LEG))
-    for k in range(legs):
-        stress = leg(out, stress, alpha, cells, depth * (0.5 - k / legs), depth / legs, follow)
-    return out
-
-
-def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar down, append the results to `out`, and return the final stresses.
-
-    stress: function for initial stresses, see `kept`; None: the pressure on the top first loads the clay.
-    y: initial height of the bar, divided by D.
-    way: displacement of the bar, divided by D.
-    """
-    begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
+    """Load the clay, then push a bar of roughness alpha by `depth` diameters."""
+    y, begin, out = depth * D / 2, 1.0, Push()
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
-    bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
-    grid, body, top = clay(cells, y=y * D, follow=bar if follow else None)
-    load = mpm.Pressure("right", lambda t: PRESSURE * (min(1, t) if begin else 1), region=top)
-    acting = {"walls": WALLS, "conditions": [load, bar], "initial_stress": stress}
-    simulation = mpm.Simulation(grid, [body], [soil], **acting)
-    if begin:
-        simulation.run(begin, begin, progress=False)
-    start = simulation.points.x
+    bar = mpm.Tool(mpm.Ball((0, y), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
+    grid, body, top = clay(cells, y=y, follow=bar if follow else None)
+    load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t / begin), region=top)
+    numerics = mpm.Numerics(renewal=True)
+    simulation = mpm.Simulation(grid, [body], [soil], walls=WALLS, conditions=[load, bar], numerics=numerics)
+    simulation.run(begin, begin, progress=False)
 
     def see(s: mpm.Simulation) -> None:
-        out.depth.append(gone + s.t - begin)
+        out.depth.append(s.t - begin)
         out.N.append(-2 * float(s.tool_forces["tool"][1]) / STRENGTH / D)
-        out.steady.append(s.t - begin > STEADY * way)
+        out.steady.append(s.t - begin > depth - STEADY)
 
-    result = simulation.run(begin + way, way / max(2, round(way * cells / STEP)), observe=see, progress=False)
+    result = simulation.run(begin + depth, depth / max(2, round(depth * cells / STEP)), observe=see, progress=False)
     points, drawn = simulation.points, bar.drawn(grid, simulation.t)
-    out.frame = points.corners, np.linalg.norm(points.x - start, axis=1) / (way * D), drawn
+    out.frame = points.corners, np.linalg.norm(points.displacement, axis=1) / (depth * D), drawn
     out.lines = tuple(x + start for x, start in zip(simulation.grid.lines, simulation.grid.base, strict=True))
-    out.steps, out.cuts = out.steps + result.steps, out.cuts + result.cuts
-    return kept(simulation)
-
-
-def kept(simulation: mpm.Simulation) -> Callable:
-    """Return a function that interpolates the effective stress (n, 3, 3) in Pa at positions x (n, 2) in m.
-
-    Interpolated stresses beyond the strength are reduced to the strength.
-    """
-    x, stress = simulation.points.x, simulation.point_fields().effective_stress
-    flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
-    between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
-
-    def bearable(x: np.ndarray) -> np.ndarray:
-        values = between(x)
-        values = np.where(np.isnan(values), nearest(x), values)  # outside the convex hull of the points
-        out = values[:, :3, None] * np.eye(3)
-        out[:, 0, 1] = out[:, 1, 0] = values[:, 3]
-        mean = np.trace(out, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
-        shear = np.sqrt(((out - mean) ** 2).sum(axis=(1, 2)) / 2)
-        return mean + (out - mean) * np.minimum(1, BEARS * STRENGTH / shear)[:, None, None]
-
-    return bearable
+    out.steps, out.cuts = result.steps, result.cuts
+    return out
 
 
 def push_wet(rate: float, cells: int, depth: float) -> Push:

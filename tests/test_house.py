@@ -17,7 +17,7 @@ CEILINGS = {
     "changes of hidden state": 0,
     "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
-    "lines of the package": 40998,
+    "lines of the package": 41000,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}

@@ -7,6 +7,7 @@ import cone
 import numpy as np
 import penetration as demo
 import pytest
+from scipy.interpolate import NearestNDInterpolator
 
 import mpm_dolfinx as mpm
 
@@ -30,28 +31,53 @@ def test_wet_clay_flows_around_a_smooth_bar(rate, depth):
 
 
 @pytest.mark.parametrize(
-    ("cells", "depth", "error"), [(4, 0.5, 0.12), pytest.param(8, 1.0, 0.03, marks=pytest.mark.slow)]
+    ("cells", "depth", "error"), [(4, 0.375, 0.12), pytest.param(8, 1.0, 0.03, marks=pytest.mark.slow)]
 )
-def test_clay_seeded_anew_resists_a_rough_bar_as_before(cells, depth, error):
+def test_clay_resists_a_rough_bar_evenly(cells, depth, error):
+    """No step is cut, and the resistance varies by less than 2 % from the second quarter of a diameter on."""
+    run = demo.push(1.0, cells, depth)
+    assert run.depth[-1] == pytest.approx(depth) and run.cuts == 0
+    last = np.array(run.N)[np.array(run.depth) > 0.25]
+    assert last.mean() == pytest.approx(demo.exact(1), rel=error)
+    assert np.ptp(last) < 0.02 * last.mean()
+
+
+def test_clay_seeded_anew_resists_a_rough_bar_as_before(monkeypatch, cells=4, way=0.2):
     """The new points have the stresses of the old points, and contact has its forces from the first step on.
 
     Before, 0.6 of the forces were not in balance at first, as a warning said.
     """
+    monkeypatch.setattr(demo, "HALF", 2.0)  # a narrower block is faster
+
+    def pushed(y, start, steps, **options):
+        bar = mpm.Tool(mpm.Ball((0, y), demo.D / 2), lambda t: (0, -max(0, t - start)), adhesion=demo.STRENGTH)
+        grid, body, top = demo.clay(cells, y=y)
+        load = mpm.Pressure(
+            "right", lambda t: demo.PRESSURE * min(1, t / start) if start else demo.PRESSURE, region=top
+        )
+        s = mpm.Simulation(grid, [body], [demo.CLAY], walls=demo.WALLS, conditions=[load, bar], **options)
+        if start:
+            s.run(start, start, progress=False)
+        result = s.run(start + steps * demo.D / cells / 24, demo.D / cells / 24, progress=False)
+        return s, -2 * result.tool_forces["tool"][1:, 1] / demo.STRENGTH
+
+    s, N = pushed(way, 1.0, round(way * cells * 24))
+    stress = s.point_fields().effective_stress
+    mean = np.trace(stress, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    shear = np.sqrt(((stress - mean) ** 2).sum(axis=(1, 2)) / 2)  # interpolated stresses must not exceed the strength
+    stress = mean + (stress - mean) * np.minimum(1, 0.999 * demo.STRENGTH / shear)[:, None, None]
+    between = NearestNDInterpolator(s.points.x, stress.reshape(-1, 9))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "initial_stress: .* until contact bears them")
-        run = demo.push(1.0, cells, depth)
-    way = np.ceil(np.array(run.depth) / demo.LEG - 1e-9)
-    ways = np.array([np.array(run.N)[run.steady & (way == k)].mean() for k in np.unique(way)])
-    assert run.depth[-1] == pytest.approx(depth) and run.cuts <= 0.15 * run.steps
-    assert ways[1:] == pytest.approx(ways[0], rel=0.02)
-    assert ways == pytest.approx(demo.exact(1), rel=error)
+        _, anew = pushed(0.0, 0.0, 6, initial_stress=lambda x: between(x).reshape(-1, 3, 3))
+    assert anew == pytest.approx(N[-1], rel=0.04)
 
 
 def test_clay_resists_a_smooth_bar_evenly_with_four_cells_over_its_diameter(monkeypatch):
     """Several contact conditions in a cell would lock the clay: error 9.9 %, and 1.3 % between two steps in a cell."""
     monkeypatch.setattr(demo, "HALF", 2.0)  # a narrower block is faster
-    run = demo.push(0.0, 4, 0.125)
-    last = np.array(run.N)[run.steady]
+    monkeypatch.setattr(demo, "STEP", 1 / 24)
+    last = np.array(demo.push(0.0, 4, 0.125).N[-3:])
     assert last.mean() == pytest.approx(demo.exact(0), rel=0.08)
     assert np.ptp(last) < 0.005 * last.mean()
 

@@ -291,6 +291,16 @@ def test_the_surface_stays_closed_if_only_some_cells_of_a_domain_can_be_renewed(
     assert (np.array(FACE_SIGNS)[faces.face] @ (last - first)) == pytest.approx([0, 0], abs=1e-9)
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-12, -1e-12, 0.25])
+def test_regions_prevent_renewal_only_if_they_divide_faces(off):
+    """Rounding of the ends of a region does not divide a face."""
+    grid = mpm.Grid([0, 0], [4, 4], [4, 4])
+    pressure = mpm.Pressure("top", 1.0, region=([1 + off, 0.0], [2.0 - off, 3.0]))
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 2])], [CLAY], walls={"bottom": "xy"}, conditions=[pressure])
+    number = SeededFaces(s.grid, s.bodies).signatures(s.state.stage.faces)[1]
+    assert (number < 0).any() == (off == 0.25)
+
+
 SUCTION = {"retention": ("VanGenuchten", {"entry": 2e3, "residual": 0.0, "n": 2.5})}
 
 

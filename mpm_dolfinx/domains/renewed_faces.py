@@ -181,7 +181,7 @@ class SeededFaces:
         for k, faces in enumerate(surfaces):
             at = np.minimum(np.searchsorted(key, keys(faces.id, faces.face)), len(key) - 1)
             ok = key[at] == keys(faces.id, faces.face)
-            whole = np.ptp(faces.xi, axis=1).max(axis=1) >= 2
+            whole = np.ptp(faces.xi, axis=1).max(axis=1) >= 2 * (1 - SAME)
             kind[at[ok & whole], k] = 1
             barred[at[ok & ~whole]] = True
         number = np.unique(kind, axis=0, return_inverse=True)[1].ravel() if len(surfaces) else np.zeros(len(key), int)
