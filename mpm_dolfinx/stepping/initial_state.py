@@ -182,8 +182,8 @@ def _stage_after(
         _warn_moved_on(scene, before, after)
     for name, volume in state.outcome.get("ponded", {}).items():
         if volume > 0 and after.given.get(name) is not before.given[name]:
-            what = "stage: %s: its pond of %.3g m^%d runs off, because this condition ends; to change the rain, "
-            warn(scene.grid.comm, ConditionWarning, f"{what}give it as a function of t", name, volume, scene.grid.dim)
+            what = "stage: %s: its pond of %.3g m^%d runs off, because this condition ends; to change the rain, give "
+            warn(scene.grid.comm, ConditionWarning, f"{what}it as a function of t", name, volume, scene.grid.stretches)
     return after
 
 
