@@ -38,14 +38,14 @@ from mpm_dolfinx.parallel.exchange import to_root
 SOFT = 0.15
 """Weight of the motion d of the corners, and of its differences along edges, relative to the volume errors.
 
-Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 1.4e-04, and twice this value by
-2.3e-04. Finer cells change it by 9.1e-02.
+Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 1.6e-04, and twice this value by
+1.4e-04. Finer cells change it by 8.5e-02.
 """
 HANGING = 1e-3
 """Largest distance of a hanging corner from its edge, divided by the cell size.
 
-Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 2.7e-05, and twice this value by
-1.1e-07. Finer cells change it by 9.1e-02.
+Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 1.3e-04, and twice this value by
+1.1e-05. Finer cells change it by 8.5e-02.
 """
 
 OF_CELL = 1 / 4

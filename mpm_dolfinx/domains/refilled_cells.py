@@ -30,8 +30,8 @@ from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resamp
 GAP = 0.01
 """Largest gap, divided by the cell size, at which faces of two domains count as one surface.
 
-Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 3.1e-05, and twice this value by
-0.0e+00. Finer cells change it by 9.1e-02.
+Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 4.0e-05, and twice this value by
+0.0e+00. Finer cells change it by 8.5e-02.
 """
 CRUMB = NEAR
 """Largest area of a removed part of a domain, divided by the area of its cell.

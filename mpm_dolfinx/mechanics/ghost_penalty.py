@@ -34,8 +34,8 @@ by 9.9e-06, and twice this value by 1.9e-05.  Finer cells change it by 1.5e-02.
 """
 YIELDING = 0.02
 """Smallest value of the factor that reduces the penalty for nearly incompressible laws with a state.  Sensitivity
-(scene "flow" of tests/plateaus.py): half this value changes the result by 6.4e-04, and twice this value by 1.1e-03.
-Finer cells change it by 8.9e-02.
+(scene "flow" of tests/plateaus.py): half this value changes the result by 6.2e-04, and twice this value by 1.0e-03.
+Finer cells change it by 8.5e-02.
 """
 RATIO = 0.3
 """If the ratio of the volume fractions of two cells is below this value, their common face has a penalty.

@@ -13,8 +13,8 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 EDGES = 4
 """Number of edges of the surface in a cell with renewed particle domains.
 
-Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 1.6e-03, and twice this value by
-1.5e-03. Finer cells change it by 9.0e-02.
+Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 2.8e-03, and twice this value by
+2.6e-04. Finer cells change it by 8.5e-02.
 """
 BENT = 1 - 3**0.5 / 2
 """Largest deviation of a surface without a corner from its chord, in cell sizes.
