@@ -215,7 +215,7 @@ def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
     axes[0].axhline(exact(alpha), color="k", ls="--", lw=0.8)
     axes[0].set(xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="dashed: exact", ylim=(0, None))
     axes[0].legend(fontsize=9)
-    show(axes[1], run, "displacement / that of the bar (-)", f"lines that follow, α = {alpha:g}", (0, 1.5))
+    show(axes[1], run, "displacement / that of the bar (-)", f"lines that follow, α = {alpha:g}", (0, 1))
     x, y = run.lines
     axes[1].vlines(x, y[0], y[-1], color="k", lw=0.4)
     axes[1].hlines(y, x[0], x[-1], color="k", lw=0.4)
@@ -234,7 +234,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
     axes[0, 0].set(ylabel="F / (s_u D) (-)", title=title, ylim=(0, None))
     for ax, alpha in zip(axes[0, 1:3], [*list(runs)[:1], *list(runs)[-1:]], strict=False):
         title = f"undrained clay, α = {alpha:g}"
-        show(ax, runs[alpha], "displacement / that of the bar (-)", title, (0, 1.5))
+        show(ax, runs[alpha], "displacement / that of the bar (-)", title, (0, 1))
     for name, run in wet.items():
         axes[0, 3].plot(run.depth, run.N, label=f"V = {RATES[name]:g}")
         axes[1, 0].plot(run.depth, run.excess, label=f"V = {RATES[name]:g}")
