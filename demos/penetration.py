@@ -8,8 +8,7 @@ resistance N of a bar with the adhesion alpha s_u on its surface is then (Randol
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
 The clay is a block, eight diameters wide and high, between smooth walls. Half of the block is computed. A pressure on
-the top keeps the gap behind the bar closed. In a narrower block the resistance is lower. In a block four diameters
-wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 cells.
+the top keeps the gap behind the bar closed. In a narrower block the resistance is lower.
 
 Clay that flows around the bar stretches by a factor of about e^4 for each diameter of depth. New domains therefore
 replace domains longer than a cell (`renewal`). Errors refer to the mean of N over the last quarter of a diameter.
@@ -137,11 +136,13 @@ def push_wet(rate: float, cells: int, depth: float) -> Push:
     speed = rate * CV / D  # m/s
     start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
     bar = mpm.Tool(mpm.Ball((0, 0), D / 2), lambda t: (0, -speed * max(0, t - start)))
-    load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t / start), region=top)
-    water = {"fluid": WATER, "conditions": [mpm.Drained("right", lambda t: PRESSURE * min(1, t / start), region=top)]}
-    acts = [load, bar, *water.pop("conditions", [])]
-    numerics = mpm.Numerics(renewal=True)
-    simulation = mpm.Simulation(grid, [body], [CLAY], walls=WALLS, conditions=acts, numerics=numerics, **water)
+
+    def pressure(t: float) -> float:
+        return PRESSURE * min(1, t / start)
+
+    acting = [mpm.Pressure("right", pressure, region=top), bar, mpm.Drained("right", pressure, region=top)]
+    given = {"walls": WALLS, "conditions": acting, "fluid": WATER, "numerics": mpm.Numerics(renewal=True)}
+    simulation = mpm.Simulation(grid, [body], [CLAY], **given)
     simulation.run(start, start, progress=False)
     out = Push()
 

@@ -28,8 +28,8 @@ def waiting(tmp_path_factory):
     """Let processes of Open MPI that are started here sleep while they wait for messages, if there is a C compiler.
 
     With `sched_yield`, the process they wait for gets only a part of the cores: scenes on three processes took twice as
-    long beside other tests. A process alone must not yield: MUMPS looks for messages all the time, and took four times
-    as long beside other tests.
+    long beside other tests. A process alone must not yield: MUMPS looks for messages all the time, and tests of the
+    beam took twice as long beside other tests.
     """
     os.environ["OMPI_MCA_mpi_yield_when_idle"] = "1"
     if compiler := shutil.which("cc"):
